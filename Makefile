@@ -1,0 +1,102 @@
+# Everything that one does with this repository. `make help` lists it; each target installs what it needs.
+#
+#   PYTHON=python3.12 make test      another interpreter for .venv
+#   PSSFLOW_SCENES=DIR make test     third-party scenes for the tests that use them
+#
+# The extension is built by maturin, into .venv, when a source is newer than the stamp .venv/.built. The Rust tests use
+# the same profile and the same features, so that nothing is compiled twice (tests/unit/test_build.py watches that).
+
+SHELL := bash
+.SHELLFLAGS := -euo pipefail -c
+.DELETE_ON_ERROR:
+.DEFAULT_GOAL := help
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+REPORTS := out/tests
+
+# rustup's own place, for shells that have not read its profile.
+export PATH := $(PATH):$(HOME)/.cargo/bin
+export VIRTUAL_ENV := $(abspath $(VENV))
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+ifneq ($(wildcard ../shared/scenes/.),)
+export PSSFLOW_SCENES ?= $(abspath ../shared/scenes)
+endif
+
+SOURCES := $(shell find rust -name '*.rs' -o -name Cargo.toml) Cargo.toml Cargo.lock pyproject.toml
+EXTENSION := $(wildcard python/pssflow/_core*.so)
+
+# Embree comes from the wheel `embreex` where the system has none; Rust tests are told where that lies.
+RUST_TEST = PSSFLOW_EMBREE_DIRS="$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("platlib"))')" \
+	cargo test --release --workspace
+
+.PHONY: help
+help: ## this list
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | sort | expand -t 12
+
+.PHONY: build
+build: $(VENV)/.built ## the extension module, into .venv
+
+.PHONY: demo
+demo: build ## scenes/teapot with random and with learned numbers: the thesis' Table 2, EXRs and a picture in out/demo
+	$(BIN)/python -m pssflow.study.demo -o out/demo
+
+.PHONY: test
+test: build ## the quick tier: Rust, Python, and whether as many tests ran as should
+	@mkdir -p $(REPORTS)
+	$(RUST_TEST) 2>&1 | tee $(REPORTS)/rust.log
+	$(BIN)/python -m pytest -m "not long" --junitxml=$(REPORTS)/python.xml
+	$(BIN)/python tests/check_count.py rust-quick=$(REPORTS)/rust.log python-quick=$(REPORTS)/python.xml
+
+.PHONY: test-long
+test-long: build ## every test, the long ones too
+	@mkdir -p $(REPORTS)
+	$(RUST_TEST) -- --include-ignored 2>&1 | tee $(REPORTS)/rust.log
+	$(BIN)/python -m pytest --junitxml=$(REPORTS)/python.xml
+	$(BIN)/python tests/check_count.py rust-all=$(REPORTS)/rust.log python-all=$(REPORTS)/python.xml
+
+.PHONY: lint
+lint: build $(VENV)/.lint ## rustfmt, clippy, ruff, pyright
+	cargo fmt --all --check
+	cargo clippy --workspace --all-targets -- -D warnings
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/basedpyright
+
+.PHONY: bench
+bench: build ## paths per second beside the rays alone and beside Mitsuba
+	$(BIN)/python -m pssflow.study.bench
+
+.PHONY: docs
+docs: build $(VENV)/.docs ## Rust API into target/doc, Python API into out/docs
+	RUSTDOCFLAGS="-D warnings" cargo doc --workspace --no-deps
+	$(BIN)/pdoc pssflow -o out/docs
+
+.PHONY: clean
+clean: ## what was built, rendered and installed here
+	rm -rf target out $(VENV) .pytest_cache .ruff_cache .hypothesis python/pssflow/_core*.so
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# --- stamps ---------------------------------------------------------------------------------------------------------
+
+# The interpreter, system libraries and maturin. What is missing is said before anything is built.
+$(VENV)/.ready: .ci/system
+	PYTHON="$(PYTHON)" .ci/system
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet 'maturin>=1.9,<2'
+	touch $@
+
+# Builds the extension and installs it (editable) with what it needs to run and to be tested.
+$(VENV)/.built: $(VENV)/.ready $(SOURCES) $(if $(EXTENSION),,missing-extension)
+	$(BIN)/maturin develop --release --extras test
+	touch $@
+
+.PHONY: missing-extension
+missing-extension:
+
+# The extras of the package that is installed by now: pip adds what they ask for and builds nothing.
+$(VENV)/.lint $(VENV)/.docs: $(VENV)/.%: pyproject.toml | $(VENV)/.built
+	$(BIN)/python -m pip install --quiet 'pssflow[$*]'
+	touch $@

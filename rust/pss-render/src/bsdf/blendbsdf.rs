@@ -1,0 +1,82 @@
+//! A weighted sum of two BSDFs: f = (1 − w)·f₀ + w·f₁, w a texture clamped to [0, 1].
+
+use serde::Deserialize;
+
+use super::{BsdfId, BsdfModel, BsdfSample, Builder, Materials, ShadingPoint};
+use crate::error::SceneError;
+use crate::math::{Rgb, Vec3};
+use crate::texture::TextureId;
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Description {
+    #[serde(default)]
+    pub(super) id: String,
+    weight: TextureId,
+    first: BsdfId,
+    second: BsdfId,
+}
+
+/// `blendbsdf`
+#[derive(Debug)]
+pub struct BlendBsdf {
+    weight: TextureId,
+    nested: [BsdfId; 2],
+}
+
+impl BlendBsdf {
+    pub(super) fn build(d: Description, b: Builder<'_>) -> Result<Self, SceneError> {
+        Ok(Self {
+            weight: b.texture(d.weight)?,
+            nested: [b.nested(d.first)?, b.nested(d.second)?],
+        })
+    }
+}
+
+impl BsdfModel for BlendBsdf {
+    fn sample(&self, at: ShadingPoint<'_>, wi: Vec3, u: [f32; 2]) -> Option<BsdfSample> {
+        let w = at.scalar(self.weight).clamp(0.0, 1.0);
+        // As Mitsuba: a number above w goes to the first BSDF, one up to w to the second.
+        let (chosen, share, u0) = if u[0] > w {
+            (0, 1.0 - w, (u[0] - w) / (1.0 - w))
+        } else {
+            (1, w, u[0] / w)
+        };
+        if share <= 0.0 {
+            return None;
+        }
+        let u = [u0.min(1.0 - f32::EPSILON / 2.0), u[1]];
+        let m = at.materials;
+        let mut s = m.bsdf(self.nested[chosen]).sample(at, wi, u)?;
+        if s.delta {
+            // The other BSDF has no density in this direction alone.
+            s.pdf *= share;
+            return Some(s);
+        }
+        let (other_value, other_pdf) = m.bsdf(self.nested[1 - chosen]).eval_pdf(at, wi, s.wo);
+        let pdf = share * s.pdf + (1.0 - share) * other_pdf;
+        s.weight = (s.weight * (share * s.pdf) + other_value * (1.0 - share)) / pdf;
+        s.pdf = pdf;
+        (pdf > 0.0).then_some(s)
+    }
+
+    fn eval_pdf(&self, at: ShadingPoint<'_>, wi: Vec3, wo: Vec3) -> (Rgb, f32) {
+        let w = at.scalar(self.weight).clamp(0.0, 1.0);
+        let m = at.materials;
+        let (f0, p0) = m.bsdf(self.nested[0]).eval_pdf(at, wi, wo);
+        let (f1, p1) = m.bsdf(self.nested[1]).eval_pdf(at, wi, wo);
+        (f0 * (1.0 - w) + f1 * w, p0 * (1.0 - w) + p1 * w)
+    }
+
+    fn transmits(&self, m: &Materials) -> bool {
+        self.nested.iter().any(|&b| m.bsdf(b).transmits(m))
+    }
+
+    fn smooth(&self, m: &Materials) -> bool {
+        self.nested.iter().any(|&b| m.bsdf(b).smooth(m))
+    }
+
+    fn anisotropic(&self, m: &Materials) -> bool {
+        self.nested.iter().any(|&b| m.bsdf(b).anisotropic(m))
+    }
+}

@@ -1,0 +1,225 @@
+//! BSDFs: formulas from the papers, values as Mitsuba's. A new one is a file here and a line in the
+//! registry below; the shared invariant tests then cover it.
+//!
+//! Directions are in the local frame (z = shading normal). `wi` points back along the path (to the
+//! camera), `wo` onwards (to the light): Mitsuba's convention for paths from the camera.
+
+use glam::Vec2;
+use serde::Deserialize;
+
+use crate::error::SceneError;
+use crate::math::{Rgb, Vec3};
+use crate::texture::{Texture, TextureId};
+
+mod fresnel;
+mod microfacet;
+
+/// Index into the scene's BSDFs.
+pub type BsdfId = usize;
+
+/// A direction drawn from a BSDF.
+#[derive(Clone, Copy, Debug)]
+pub struct BsdfSample {
+    /// Local direction onwards.
+    pub wo: Vec3,
+    /// f·|cos θ_o| ÷ pdf.
+    pub weight: Rgb,
+    /// Density in solid angle; the lobe's probability where `delta` is set.
+    pub pdf: f32,
+    /// A mirror or a straight passage: NEE cannot join it, and no hemisphere can carry it.
+    pub delta: bool,
+}
+
+/// The tables that nested BSDFs and their textures are looked up in.
+#[derive(Debug, Default)]
+pub struct Materials {
+    pub(crate) bsdfs: Vec<Bsdf>,
+    pub(crate) textures: Vec<Texture>,
+}
+
+impl Materials {
+    /// A BSDF of the scene.
+    #[inline]
+    pub fn bsdf(&self, id: BsdfId) -> &Bsdf {
+        &self.bsdfs[id]
+    }
+
+    /// A texture of the scene.
+    #[inline]
+    pub fn texture(&self, id: TextureId) -> &Texture {
+        &self.textures[id]
+    }
+}
+
+/// Where a BSDF is evaluated.
+#[derive(Clone, Copy, Debug)]
+pub struct ShadingPoint<'a> {
+    /// Texture coordinates.
+    pub uv: Vec2,
+    /// Textures and nested BSDFs.
+    pub materials: &'a Materials,
+}
+
+impl ShadingPoint<'_> {
+    #[inline]
+    pub(crate) fn rgb(&self, texture: TextureId) -> Rgb {
+        self.materials.textures[texture].eval(self.uv)
+    }
+
+    #[inline]
+    pub(crate) fn scalar(&self, texture: TextureId) -> f32 {
+        self.materials.textures[texture].eval_scalar(self.uv)
+    }
+}
+
+/// What each BSDF file provides.
+pub(crate) trait BsdfModel {
+    /// Draws `wo`; the lobe is chosen from `u[0]`, which is then rescaled and reused. `None`: the
+    /// light path ends here (no such direction, or its weight is zero).
+    fn sample(&self, at: ShadingPoint<'_>, wi: Vec3, u: [f32; 2]) -> Option<BsdfSample>;
+
+    /// f·|cos θ_o| and the density of [`BsdfModel::sample`] in solid angle, delta lobes left out.
+    fn eval_pdf(&self, at: ShadingPoint<'_>, wi: Vec3, wo: Vec3) -> (Rgb, f32);
+
+    /// Whether it carries light to the other side.
+    fn transmits(&self, _materials: &Materials) -> bool {
+        false
+    }
+
+    /// Whether any lobe is smooth, so that NEE can join it.
+    fn smooth(&self, _materials: &Materials) -> bool {
+        true
+    }
+
+    /// Whether the azimuth matters, so that Mitsuba's uv frame must be kept.
+    fn anisotropic(&self, _materials: &Materials) -> bool {
+        false
+    }
+}
+
+/// What a BSDF's parts refer to, checked while the scene is built.
+pub(crate) struct Builder<'a> {
+    pub(crate) materials: &'a Materials,
+    pub(crate) id: String,
+}
+
+impl Builder<'_> {
+    fn owner(&self) -> String {
+        format!("bsdf {:?}", self.id)
+    }
+
+    pub(crate) fn texture(&self, id: TextureId) -> Result<TextureId, SceneError> {
+        crate::description::check_index(
+            id,
+            self.materials.textures.len(),
+            &self.owner(),
+            "texture",
+        )?;
+        Ok(id)
+    }
+
+    pub(crate) fn optional(&self, id: Option<TextureId>) -> Result<Option<TextureId>, SceneError> {
+        id.map(|id| self.texture(id)).transpose()
+    }
+
+    /// A nested BSDF must have been built already, so no BSDF can contain itself.
+    pub(crate) fn nested(&self, id: BsdfId) -> Result<BsdfId, SceneError> {
+        if id < self.materials.bsdfs.len() {
+            Ok(id)
+        } else {
+            Err(SceneError::Recursion {
+                id: self.id.clone(),
+            })
+        }
+    }
+
+    pub(crate) fn check(
+        &self,
+        ok: bool,
+        name: &'static str,
+        value: f32,
+        rule: &'static str,
+    ) -> Result<(), SceneError> {
+        crate::description::check(ok, &self.owner(), name, value, rule)
+    }
+}
+
+macro_rules! registry {
+    ($($name:literal => $variant:ident in $module:ident;)*) => {
+        $(mod $module;)*
+
+        /// Part of the scene description: one BSDF.
+        #[derive(Debug, Deserialize)]
+        #[serde(tag = "type")]
+        pub(crate) enum Description {
+            $(#[serde(rename = $name)] $variant($module::Description),)*
+        }
+
+        impl Description {
+            fn id(&self) -> &str {
+                match self { $(Self::$variant(d) => &d.id,)* }
+            }
+        }
+
+        /// A BSDF of the scene.
+        #[derive(Debug)]
+        pub enum Bsdf {
+            $(#[doc = concat!("`", $name, "`")] $variant($module::$variant),)*
+        }
+
+        impl Bsdf {
+            pub(crate) fn build(
+                description: Description,
+                materials: &Materials,
+            ) -> Result<Self, SceneError> {
+                let builder = Builder { materials, id: description.id().to_owned() };
+                Ok(match description {
+                    $(Description::$variant(d) => Self::$variant($module::$variant::build(d, builder)?),)*
+                })
+            }
+
+            /// Draws a direction onwards from two numbers; `None` ends the path.
+            #[inline]
+            pub fn sample(&self, at: ShadingPoint<'_>, wi: Vec3, u: [f32; 2]) -> Option<BsdfSample> {
+                match self { $(Self::$variant(b) => b.sample(at, wi, u),)* }
+            }
+
+            /// f·|cos θ_o| and the density of [`Bsdf::sample`] in solid angle, delta lobes left out.
+            #[inline]
+            pub fn eval_pdf(&self, at: ShadingPoint<'_>, wi: Vec3, wo: Vec3) -> (Rgb, f32) {
+                match self { $(Self::$variant(b) => b.eval_pdf(at, wi, wo),)* }
+            }
+
+            /// Whether it carries light to the other side.
+            pub fn transmits(&self, materials: &Materials) -> bool {
+                match self { $(Self::$variant(b) => b.transmits(materials),)* }
+            }
+
+            /// Whether any lobe is smooth, so that NEE can join it.
+            pub fn smooth(&self, materials: &Materials) -> bool {
+                match self { $(Self::$variant(b) => b.smooth(materials),)* }
+            }
+
+            /// Whether the azimuth matters, so that Mitsuba's uv frame is kept.
+            pub fn anisotropic(&self, materials: &Materials) -> bool {
+                match self { $(Self::$variant(b) => b.anisotropic(materials),)* }
+            }
+
+            /// The plugin's name.
+            pub fn name(&self) -> &'static str {
+                match self { $(Self::$variant(_) => $name,)* }
+            }
+        }
+
+        /// The names of all BSDFs.
+        pub const NAMES: &[&str] = &[$($name),*];
+    };
+}
+
+registry! {
+    "blendbsdf" => BlendBsdf in blendbsdf;
+    "diffuse" => Diffuse in diffuse;
+    "roughconductor" => RoughConductor in roughconductor;
+    "roughplastic" => RoughPlastic in roughplastic;
+    "twosided" => TwoSided in twosided;
+}

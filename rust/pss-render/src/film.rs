@@ -1,0 +1,293 @@
+//! The film: which pixels there are, and how samples add up to them.
+//!
+//! A pixel is Σ w·v / Σ w over the samples within the filter's radius, as in Mitsuba's `hdrfilm`; for the
+//! box filter that is the mean of the pixel's own samples. Beside it the variance of that mean:
+//! Σ w²(v − pixel)² / (Σ w)², with Bessel's correction for equal weights.
+
+use crate::error::SceneError;
+use crate::math::Rgb;
+use crate::sensor::FilmDescription;
+
+/// Size, crop and reconstruction filter.
+#[derive(Clone, Debug)]
+pub struct Film {
+    size: [u32; 2],
+    crop_offset: [u32; 2],
+    crop_size: [u32; 2],
+    filter: Option<Filter>,
+    filter_name: String,
+}
+
+/// A tabulated separable filter.
+#[derive(Clone, Debug)]
+struct Filter {
+    radius: f32,
+    /// Values at equal steps over [0, radius].
+    table: Vec<f32>,
+}
+
+impl Filter {
+    #[inline]
+    fn eval(&self, x: f32) -> f32 {
+        let x = x.abs() / self.radius;
+        if x >= 1.0 {
+            return 0.0;
+        }
+        let t = x * (self.table.len() - 1) as f32;
+        let i = (t as usize).min(self.table.len() - 2);
+        self.table[i] + (self.table[i + 1] - self.table[i]) * (t - i as f32)
+    }
+}
+
+impl Film {
+    pub(crate) fn build(d: FilmDescription) -> Result<Self, SceneError> {
+        let value = |name: &'static str, value: f64, rule: &'static str| SceneError::Value {
+            owner: "film".to_owned(),
+            name,
+            place: String::new(),
+            value,
+            rule,
+        };
+        for axis in 0..2 {
+            let (size, crop, offset) = (d.size[axis], d.crop_size[axis], d.crop_offset[axis]);
+            if size == 0 || size > 1 << 16 {
+                return Err(value("size", f64::from(size), "between 1 and 65536 pixels"));
+            }
+            if crop == 0 || u64::from(offset) + u64::from(crop) > u64::from(size) {
+                return Err(value(
+                    "crop_size",
+                    f64::from(crop),
+                    "positive and inside the film",
+                ));
+            }
+        }
+        let filter = if d.rfilter.name == "box" {
+            None
+        } else {
+            let f = d.rfilter;
+            if !(f.radius > 0.0 && f.radius <= 64.0) {
+                return Err(value(
+                    "rfilter.radius",
+                    f.radius.into(),
+                    "between 0 and 64 pixels",
+                ));
+            }
+            if f.table.len() < 2 || f.table.iter().any(|x| !x.is_finite()) {
+                return Err(value(
+                    "rfilter.table",
+                    f.table.len() as f64,
+                    "two or more finite values",
+                ));
+            }
+            Some(Filter {
+                radius: f.radius,
+                table: f.table,
+            })
+        };
+        let filter_name = if filter.is_some() { "table" } else { "box" }.to_owned();
+        Ok(Self {
+            size: d.size,
+            crop_offset: d.crop_offset,
+            crop_size: d.crop_size,
+            filter,
+            filter_name,
+        })
+    }
+
+    /// Whole film, (width, height).
+    pub fn size(&self) -> [u32; 2] {
+        self.size
+    }
+
+    /// Corner of the crop within the film.
+    pub fn crop_offset(&self) -> [u32; 2] {
+        self.crop_offset
+    }
+
+    /// Size of the image that is rendered, (width, height).
+    pub fn crop_size(&self) -> [u32; 2] {
+        self.crop_size
+    }
+
+    /// Number of rendered pixels.
+    pub fn pixels(&self) -> usize {
+        self.crop_size[0] as usize * self.crop_size[1] as usize
+    }
+
+    /// `box`, or `table` for all other filters.
+    pub fn filter_name(&self) -> &str {
+        &self.filter_name
+    }
+
+    /// Pixels beyond a tile's edge that its samples reach.
+    pub fn border(&self) -> u32 {
+        self.filter
+            .as_ref()
+            .map_or(0, |f| (f.radius - 0.5).ceil().max(0.0) as u32)
+    }
+}
+
+/// A rectangle of pixels, in crop coordinates.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Tile {
+    /// First column.
+    pub x: u32,
+    /// First row.
+    pub y: u32,
+    /// Columns.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+}
+
+/// Sums of one pixel. `f64`, since thousands of passes add up here.
+#[derive(Clone, Copy, Debug, Default)]
+struct Sums {
+    /// Σ w
+    weight: f64,
+    /// Σ w²
+    weight_2: f64,
+    /// Σ w·v
+    value: [f64; 3],
+    /// Σ w²·v
+    value_w2: [f64; 3],
+    /// Σ w²·v²
+    square_w2: [f64; 3],
+}
+
+/// Samples added up over a rectangle of pixels.
+#[derive(Clone, Debug)]
+pub struct Accumulator {
+    tile: Tile,
+    sums: Vec<Sums>,
+}
+
+impl Accumulator {
+    /// An empty one for `tile`, widened by the filter's border and cut at the crop.
+    pub fn new(film: &Film, tile: Tile) -> Self {
+        let border = film.border();
+        let (x, y) = (tile.x.saturating_sub(border), tile.y.saturating_sub(border));
+        let right = (tile.x + tile.width + border).min(film.crop_size[0]);
+        let bottom = (tile.y + tile.height + border).min(film.crop_size[1]);
+        let tile = Tile {
+            x,
+            y,
+            width: right - x,
+            height: bottom - y,
+        };
+        Self {
+            tile,
+            sums: vec![Sums::default(); tile.width as usize * tile.height as usize],
+        }
+    }
+
+    /// An empty one for the whole image.
+    pub fn whole(film: &Film) -> Self {
+        let [width, height] = film.crop_size;
+        Self::new(
+            film,
+            Tile {
+                x: 0,
+                y: 0,
+                width,
+                height,
+            },
+        )
+    }
+
+    /// Adds a sample at a film position (pixels from the crop's corner).
+    #[inline]
+    pub fn add(&mut self, film: &Film, position: [f32; 2], value: Rgb) {
+        match &film.filter {
+            None => self.splat(position[0] as u32, position[1] as u32, 1.0, value),
+            Some(filter) => {
+                let range = |x: f32, start: u32, n: u32| {
+                    let first = (x - 0.5 - filter.radius).ceil().max(start as f32) as u32;
+                    let last = (x - 0.5 + filter.radius)
+                        .floor()
+                        .min((start + n) as f32 - 1.0);
+                    (first, last)
+                };
+                let (x0, x1) = range(position[0], self.tile.x, self.tile.width);
+                let (y0, y1) = range(position[1], self.tile.y, self.tile.height);
+                let mut y = y0;
+                while y as f32 <= y1 {
+                    let wy = filter.eval(y as f32 + 0.5 - position[1]);
+                    let mut x = x0;
+                    while x as f32 <= x1 {
+                        let w = wy * filter.eval(x as f32 + 0.5 - position[0]);
+                        if w != 0.0 {
+                            self.splat(x, y, w, value);
+                        }
+                        x += 1;
+                    }
+                    y += 1;
+                }
+            }
+        }
+    }
+
+    #[inline]
+    fn splat(&mut self, x: u32, y: u32, w: f32, value: Rgb) {
+        let x = x.clamp(self.tile.x, self.tile.x + self.tile.width - 1) - self.tile.x;
+        let y = y.clamp(self.tile.y, self.tile.y + self.tile.height - 1) - self.tile.y;
+        let s = &mut self.sums[(y * self.tile.width + x) as usize];
+        let w = f64::from(w);
+        s.weight += w;
+        s.weight_2 += w * w;
+        // Most paths carry nothing.
+        if value != Rgb::ZERO {
+            for (c, v) in value.to_array().into_iter().map(f64::from).enumerate() {
+                s.value[c] += w * v;
+                s.value_w2[c] += w * w * v;
+                s.square_w2[c] += w * w * v * v;
+            }
+        }
+    }
+
+    /// Adds another accumulator's sums; where they overlap, in the caller's order.
+    pub fn merge(&mut self, other: &Self) {
+        let (a, b) = (self.tile, other.tile);
+        for row in 0..b.height {
+            for column in 0..b.width {
+                let (x, y) = (b.x + column - a.x, b.y + row - a.y);
+                let to = &mut self.sums[(y * a.width + x) as usize];
+                let from = &other.sums[(row * b.width + column) as usize];
+                to.weight += from.weight;
+                to.weight_2 += from.weight_2;
+                for c in 0..3 {
+                    to.value[c] += from.value[c];
+                    to.value_w2[c] += from.value_w2[c];
+                    to.square_w2[c] += from.square_w2[c];
+                }
+            }
+        }
+    }
+
+    /// The image: per pixel and channel the mean and the variance of the mean, rows from the top.
+    pub fn develop(&self) -> (Vec<f32>, Vec<f32>) {
+        let mut image = Vec::with_capacity(3 * self.sums.len());
+        let mut variance = Vec::with_capacity(3 * self.sums.len());
+        for s in &self.sums {
+            for c in 0..3 {
+                let (mut mean, mut var) = (0.0, 0.0);
+                if s.weight != 0.0 {
+                    mean = s.value[c] / s.weight;
+                    let squares =
+                        s.square_w2[c] - 2.0 * mean * s.value_w2[c] + mean * mean * s.weight_2;
+                    // Σw² / (Σw)² = 1/n for n equal weights; n/(n − 1) makes the estimate unbiased.
+                    let inverse_n = s.weight_2 / (s.weight * s.weight);
+                    var = squares.max(0.0) / (s.weight * s.weight);
+                    var = if inverse_n < 1.0 {
+                        var / (1.0 - inverse_n)
+                    } else {
+                        f64::INFINITY
+                    };
+                }
+                image.push(mean as f32);
+                variance.push(var as f32);
+            }
+        }
+        (image, variance)
+    }
+}

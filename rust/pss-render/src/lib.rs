@@ -1,0 +1,34 @@
+//! Path tracer in primary sample space: f(u) for a Mitsuba scene.
+//!
+//! A path of k bounces is a function of its primary numbers u; this crate evaluates it, in blocks, for a
+//! scene that came from Mitsuba through [`Scene::new`]. Start reading at [`path`], which is the main loop;
+//! [`columns`] says what each number decides.
+//!
+//! Deliberately absent: learning (a guide is seen only as a [`path::NumberSource`]), Python, files, random
+//! numbers, and the division by a density.
+
+pub mod bsdf;
+pub mod columns;
+mod description;
+mod distribution;
+pub mod emitter;
+mod error;
+pub mod film;
+mod interaction;
+pub mod math;
+pub mod path;
+mod scene;
+mod sensor;
+pub mod shape;
+pub mod texture;
+mod warp;
+
+pub use columns::{Columns, Decision, EmitterStrategy};
+pub use description::{Array, SCHEMA};
+pub use distribution::Discrete;
+pub use error::{SceneError, TraceError};
+pub use film::{Accumulator, Film, Tile};
+pub use interaction::Interaction;
+pub use path::{NumberSource, Parametrisation, Paths, Tracer, Uniform, VertexContext};
+pub use scene::{Scene, Summary};
+pub use sensor::Sensor;

@@ -1,0 +1,659 @@
+//! The main loop: a path camera → x₁ → … → x_k → light as a function of its primary numbers u.
+//!
+//! For uniform u the pixel's k-bounce radiance is the mean of
+//!
+//! f(u) = β_k · [ w_nee · f_s · |cos θ| · L_e · V ÷ p_nee  +  w_bsdf · f_s · |cos θ| · L_e ÷ p_bsdf ]
+//!
+//! with the throughput β_k = Π_{b<k} f_s(x_b)·|cos θ_b| ÷ p_b, p_b the baseline density of the
+//! parametrisation, V the visibility, and w the balance heuristic of the baseline densities (Veach 1997),
+//! so that f does not depend on any guide. The two terms are returned apart: the first uses the columns
+//! 0 … 2k, the second the directions' columns and two of its own, so a guide divides them by different
+//! marginals. Dividing is the caller's business: f leaves this module undivided.
+//!
+//! Blocks of paths go through the stages together (start reading at [`Tracer::trace`]); at each stage the
+//! tracer asks a [`NumberSource`] what the stage's numbers shall be. Radiance in W·sr⁻¹·m⁻², linear sRGB.
+//! This module draws no number, allocates nothing per path, and knows neither guides nor Python.
+
+use std::ops::Range;
+
+use embree4::{Hit, Ray};
+use serde::{Deserialize, Serialize};
+
+use crate::bsdf::{BsdfSample, ShadingPoint};
+use crate::columns::{Columns, Decision, EmitterStrategy};
+use crate::error::TraceError;
+use crate::interaction::Interaction;
+use crate::math::{Frame, Rgb, Vec3};
+use crate::scene::{BsdfTraits, Scene};
+use crate::warp::{
+    UNIFORM_HEMISPHERE_PDF, cosine_hemisphere_pdf, square_to_cosine_hemisphere,
+    square_to_uniform_hemisphere,
+};
+
+/// What the two numbers of a direction mean.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Parametrisation {
+    /// The BSDF's own importance sampling.
+    #[default]
+    Bsdf,
+    /// A cosine-weighted hemisphere on wi's side.
+    Cosine,
+    /// A uniform hemisphere on wi's side.
+    Uniform,
+}
+
+impl Parametrisation {
+    /// The name used in options and hashes.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Bsdf => "bsdf",
+            Self::Cosine => "cosine",
+            Self::Uniform => "uniform",
+        }
+    }
+}
+
+/// What a guide may look at when it decides the numbers at a vertex.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct VertexContext {
+    /// Vertex, world space.
+    pub position: [f32; 3],
+    /// Shading normal on the side that the path came from.
+    pub normal: [f32; 3],
+    /// Unit direction back to the previous vertex, world space.
+    pub outgoing: [f32; 3],
+    /// Film position, [0, 1)² over the crop.
+    pub pixel: [f32; 2],
+    /// Emitter chosen, where that is known already.
+    pub emitter: u32,
+    /// Which vertex: b of x_b.
+    pub bounce: u32,
+}
+
+/// The paths that a stage's numbers are decided for.
+#[derive(Debug)]
+pub struct Lanes<'a> {
+    /// Rows of `u` and `q` that are alive.
+    pub active: &'a [u32],
+    /// One context an active path, if [`NumberSource::looks_at_vertices`]; else empty.
+    pub contexts: &'a [VertexContext],
+    /// Primary numbers, `width` a path; uniform in this decision's columns until replaced.
+    pub u: &'a mut [f32],
+    /// Row length of `u`.
+    pub width: usize,
+    /// Columns of this decision.
+    pub columns: Range<usize>,
+    /// Per path: product of the densities of all decisions so far.
+    pub q: &'a mut [f32],
+}
+
+/// Where the tracer gets its numbers from: contexts in, numbers and densities out, in blocks.
+pub trait NumberSource {
+    /// May replace the numbers of `lanes.columns` in the active rows of `u`, and multiplies their density
+    /// (with respect to uniform numbers) into `lanes.q`. Numbers left alone have density 1.
+    fn decide(&mut self, decision: Decision, lanes: Lanes<'_>);
+
+    /// Whether contexts are wanted.
+    fn looks_at_vertices(&self) -> bool {
+        false
+    }
+}
+
+/// Leaves every number as it is: random sampling.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Uniform;
+
+impl NumberSource for Uniform {
+    fn decide(&mut self, _decision: Decision, _lanes: Lanes<'_>) {}
+}
+
+/// A block of paths: what goes in, and what comes out. Structure of arrays, reused block after block.
+#[derive(Debug)]
+pub struct Paths {
+    columns: Columns,
+    /// In: film positions in pixels from the crop's corner.
+    pub film: Vec<[f32; 2]>,
+    /// In: uniform numbers, [`Columns::width`] a path. Out: the numbers that were used.
+    pub u: Vec<f32>,
+    /// Out: the term of next-event estimation, undivided.
+    pub f_nee: Vec<Rgb>,
+    /// Out: the term of the BSDF-sampled ray, undivided; zero with `nee`.
+    pub f_bsdf: Vec<Rgb>,
+    /// Out: density of the numbers that `f_nee` uses.
+    pub q_nee: Vec<f32>,
+    /// Out: density of the numbers that `f_bsdf` uses.
+    pub q_bsdf: Vec<f32>,
+    /// Out: whether x₁ … x_k all exist.
+    pub found: Vec<bool>,
+    /// Out, if `record`: contexts of x₁ … x_k, k a path; default where a vertex does not exist.
+    pub contexts: Vec<VertexContext>,
+    /// In: whether to record contexts.
+    pub record: bool,
+    /// Out: paths whose f was not finite and was set to zero.
+    pub non_finite: u64,
+    active: Vec<u32>,
+    states: Vec<State>,
+    stage_contexts: Vec<VertexContext>,
+}
+
+/// Where a path stands.
+#[derive(Clone, Copy, Debug)]
+struct State {
+    ray: Ray,
+    /// β: product of f_s·|cos θ| ÷ p so far.
+    throughput: Rgb,
+    si: Interaction,
+    frame: Frame,
+    /// Local direction back along the path.
+    wi: Vec3,
+    emitter: u32,
+    emitter_probability: f32,
+}
+
+impl Paths {
+    /// An empty block for the given columns.
+    pub fn new(columns: Columns) -> Self {
+        Self {
+            columns,
+            film: Vec::new(),
+            u: Vec::new(),
+            f_nee: Vec::new(),
+            f_bsdf: Vec::new(),
+            q_nee: Vec::new(),
+            q_bsdf: Vec::new(),
+            found: Vec::new(),
+            contexts: Vec::new(),
+            record: false,
+            non_finite: 0,
+            active: Vec::new(),
+            states: Vec::new(),
+            stage_contexts: Vec::new(),
+        }
+    }
+
+    /// Number of paths.
+    pub fn len(&self) -> usize {
+        self.film.len()
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.film.is_empty()
+    }
+
+    /// f(u) of path `i`, both terms.
+    pub fn f(&self, i: usize) -> Rgb {
+        self.f_nee[i] + self.f_bsdf[i]
+    }
+
+    /// Takes numbers from outside, checked.
+    ///
+    /// # Errors
+    /// [`TraceError`] where the shape of `u` or a value in it is wrong.
+    pub fn set(&mut self, u: &[f32], width: usize, film: &[[f32; 2]]) -> Result<(), TraceError> {
+        let expected = self.columns.width();
+        if width != expected {
+            return Err(TraceError::Columns {
+                found: width,
+                expected,
+                k: self.columns.k(),
+                strategy: self.columns.strategy().name(),
+                columns: self.columns.names().join(", "),
+            });
+        }
+        if film.len() * width != u.len() {
+            return Err(TraceError::Rows {
+                found: film.len(),
+                expected: u.len() / width,
+            });
+        }
+        if let Some(i) = u.iter().position(|x| !(0.0..1.0).contains(x)) {
+            return Err(TraceError::Range {
+                row: i / width,
+                column: i % width,
+                value: u[i],
+            });
+        }
+        self.u.clear();
+        self.u.extend_from_slice(u);
+        self.film.clear();
+        self.film.extend_from_slice(film);
+        Ok(())
+    }
+
+    fn reset(&mut self) {
+        let n = self.film.len();
+        self.f_nee.clear();
+        self.f_nee.resize(n, Rgb::ZERO);
+        self.f_bsdf.clear();
+        self.f_bsdf.resize(n, Rgb::ZERO);
+        self.q_nee.clear();
+        self.q_nee.resize(n, 1.0);
+        self.q_bsdf.clear();
+        self.q_bsdf.resize(n, 1.0);
+        self.found.clear();
+        self.found.resize(n, false);
+        self.active.clear();
+        self.active.extend(0..n as u32);
+        self.contexts.clear();
+        if self.record {
+            self.contexts
+                .resize(n * self.columns.k(), VertexContext::default());
+        }
+        self.non_finite = 0;
+    }
+
+    /// The numbers of a two-number decision.
+    fn pair(&self, lane: usize, decision: Decision) -> [f32; 2] {
+        let at = lane * self.columns.width() + self.columns.range(decision).start;
+        [self.u[at], self.u[at + 1]]
+    }
+}
+
+/// Turns numbers into radiance, for one scene and one table of columns.
+#[derive(Clone, Copy, Debug)]
+pub struct Tracer<'a> {
+    scene: &'a Scene,
+    columns: Columns,
+    parametrisation: Parametrisation,
+}
+
+impl<'a> Tracer<'a> {
+    /// A tracer for `k` bounces, 1 ≤ k ≤ 32.
+    ///
+    /// # Errors
+    /// [`TraceError::Bounces`].
+    pub fn new(
+        scene: &'a Scene,
+        k: usize,
+        parametrisation: Parametrisation,
+        strategy: EmitterStrategy,
+    ) -> Result<Self, TraceError> {
+        if !(1..=32).contains(&k) {
+            return Err(TraceError::Bounces(k));
+        }
+        Ok(Self {
+            scene,
+            columns: Columns::new(k, strategy),
+            parametrisation,
+        })
+    }
+
+    /// The table of columns.
+    pub fn columns(&self) -> Columns {
+        self.columns
+    }
+
+    /// The scene.
+    pub fn scene(&self) -> &'a Scene {
+        self.scene
+    }
+
+    /// What a direction's numbers mean.
+    pub fn parametrisation(&self) -> Parametrisation {
+        self.parametrisation
+    }
+
+    /// Traces a block: fills f, q and the flags of `paths` from its film positions and numbers.
+    pub fn trace(&self, paths: &mut Paths, numbers: &mut dyn NumberSource) {
+        let k = self.columns.k();
+        paths.reset();
+
+        // ---------------- Numbers that are decided before the path is known ----------------
+        self.ask(paths, numbers, Decision::Path);
+        self.drop_outside(paths);
+
+        // ---------------- Camera → x₁ → … → x_k ----------------
+        self.camera_rays(paths);
+        for b in 1..=k {
+            if b == 1 {
+                self.first_vertices(paths);
+            } else {
+                self.next_vertices(paths);
+            }
+            self.record_contexts(paths, b);
+            if b < k {
+                self.ask(paths, numbers, Decision::Direction(b));
+                self.scatter(paths, b);
+            }
+        }
+        for &lane in &paths.active {
+            paths.found[lane as usize] = true;
+        }
+        // The BSDF-sampled ray depends on the numbers up to here; the light's come after.
+        paths.q_bsdf.copy_from_slice(&paths.q_nee);
+
+        // ---------------- x_k → light: next-event estimation ----------------
+        self.ask(paths, numbers, Decision::Emitter);
+        self.choose_emitters(paths);
+        self.ask(paths, numbers, Decision::Light);
+        self.next_event(paths);
+
+        // ---------------- x_k → light: BSDF-sampled ray ----------------
+        if self.columns.strategy() == EmitterStrategy::Mis {
+            self.bsdf_rays(paths);
+        }
+        Self::drop_non_finite(paths);
+    }
+
+    /// Asks the source what a stage's numbers shall be.
+    fn ask(&self, paths: &mut Paths, numbers: &mut dyn NumberSource, decision: Decision) {
+        if paths.active.is_empty() {
+            return;
+        }
+        paths.stage_contexts.clear();
+        if numbers.looks_at_vertices() {
+            let bounce = match decision {
+                Decision::Path => 0,
+                Decision::Direction(b) => b,
+                Decision::Emitter | Decision::Light | Decision::BsdfRay => self.columns.k(),
+            };
+            for i in 0..paths.active.len() {
+                let context = self.context(paths, paths.active[i] as usize, bounce);
+                paths.stage_contexts.push(context);
+            }
+        }
+        numbers.decide(
+            decision,
+            Lanes {
+                active: &paths.active,
+                contexts: &paths.stage_contexts,
+                u: &mut paths.u,
+                width: self.columns.width(),
+                columns: self.columns.range(decision),
+                q: &mut paths.q_nee,
+            },
+        );
+    }
+
+    /// A guide whose prior has no boundary may leave the cube: f is zero out there.
+    fn drop_outside(&self, paths: &mut Paths) {
+        let learned = self.columns.learned();
+        let (u, width) = (&paths.u, self.columns.width());
+        paths.active.retain(|&lane| {
+            u[lane as usize * width..][..learned]
+                .iter()
+                .all(|x| (0.0..1.0).contains(x))
+        });
+    }
+
+    fn camera_rays(&self, paths: &mut Paths) {
+        let sensor = self.scene.sensor();
+        let film = &paths.film;
+        paths.states.clear();
+        paths.states.extend(film.iter().map(|&position| State {
+            ray: sensor.ray(position),
+            throughput: Rgb::ONE,
+            si: Interaction::default(),
+            frame: Frame::default(),
+            wi: Vec3::ZERO,
+            emitter: 0,
+            emitter_probability: 0.0,
+        }));
+    }
+
+    /// x₁, by coherent packets: neighbours in a block are neighbours on the film.
+    fn first_vertices(&self, paths: &mut Paths) {
+        let mut kept = 0;
+        let mut rays = [Ray::new([0.0; 3], [0.0, 0.0, 1.0]); 16];
+        let mut hits: [Option<Hit>; 16] = [None; 16];
+        for start in (0..paths.active.len()).step_by(16) {
+            let n = (paths.active.len() - start).min(16);
+            for i in 0..n {
+                rays[i] = paths.states[paths.active[start + i] as usize].ray;
+            }
+            self.scene
+                .accel()
+                .intersect_packet16(&rays[..n], &mut hits[..n], true);
+            for (i, hit) in hits[..n].iter().enumerate() {
+                let lane = paths.active[start + i];
+                if let Some(hit) = hit {
+                    self.arrive(&mut paths.states[lane as usize], hit);
+                    paths.active[kept] = lane;
+                    kept += 1;
+                }
+            }
+        }
+        paths.active.truncate(kept);
+    }
+
+    /// x_b for b > 1, ray by ray: packets do not help incoherent rays.
+    fn next_vertices(&self, paths: &mut Paths) {
+        let states = &mut paths.states;
+        paths.active.retain(|&lane| {
+            let state = &mut states[lane as usize];
+            match self.scene.accel().intersect(&state.ray) {
+                Some(hit) => {
+                    self.arrive(state, &hit);
+                    true
+                }
+                None => false,
+            }
+        });
+    }
+
+    /// Sets up shading at a hit.
+    #[inline]
+    fn arrive(&self, state: &mut State, hit: &Hit) {
+        state.si = self.scene.interaction(&state.ray, hit);
+        // Numbers are measured in a frame of the normal alone, so that neighbours agree; only where the
+        // azimuth matters is it the uv frame.
+        state.frame = if self.bsdf_traits(state).anisotropic {
+            state.si.uv_frame()
+        } else {
+            Frame::from_normal(state.si.shading_normal)
+        };
+        state.wi = state.frame.to_local(-Vec3::from_array(state.ray.dir));
+    }
+
+    /// x_b → x_{b+1}: a direction from two numbers, and what it does to the throughput.
+    fn scatter(&self, paths: &mut Paths, b: usize) {
+        let mut kept = 0;
+        for i in 0..paths.active.len() {
+            let lane = paths.active[i];
+            let u = paths.pair(lane as usize, Decision::Direction(b));
+            let state = &mut paths.states[lane as usize];
+            let Some(sample) = self.sample_direction(state, u) else {
+                continue;
+            };
+            state.throughput *= sample.weight;
+            if state.throughput.max_element() <= 0.0 {
+                continue;
+            }
+            let wo = state.frame.to_world(sample.wo);
+            state.ray = state.si.spawn_ray(wo);
+            paths.active[kept] = lane;
+            kept += 1;
+        }
+        paths.active.truncate(kept);
+    }
+
+    /// A direction by the parametrisation's baseline density.
+    fn sample_direction(&self, state: &State, u: [f32; 2]) -> Option<BsdfSample> {
+        let at = self.shading_point(state);
+        let bsdf = self.bsdf(state);
+        let traits = self.bsdf_traits(state);
+        // No hemisphere carries delta or transmitted light.
+        if self.parametrisation == Parametrisation::Bsdf || !traits.smooth || traits.transmits {
+            return bsdf.sample(at, state.wi, u);
+        }
+        let (mut wo, pdf) = if self.parametrisation == Parametrisation::Cosine {
+            let wo = square_to_cosine_hemisphere(u);
+            (wo, cosine_hemisphere_pdf(wo.z))
+        } else {
+            (square_to_uniform_hemisphere(u), UNIFORM_HEMISPHERE_PDF)
+        };
+        wo.z = wo.z.copysign(state.wi.z);
+        if pdf <= 0.0 {
+            return None;
+        }
+        let (value, _) = bsdf.eval_pdf(at, state.wi, wo);
+        Some(BsdfSample {
+            wo,
+            weight: value / pdf,
+            pdf,
+            delta: false,
+        })
+    }
+
+    fn choose_emitters(&self, paths: &mut Paths) {
+        let column = self.columns.range(Decision::Emitter).start;
+        for &lane in &paths.active {
+            let u = paths.u[lane as usize * self.columns.width() + column];
+            let state = &mut paths.states[lane as usize];
+            (state.emitter, state.emitter_probability) =
+                match self.scene.emitter_choice().sample_reuse(u) {
+                    Some((emitter, probability, _)) => (emitter as u32, probability),
+                    None => (0, 0.0),
+                };
+        }
+    }
+
+    /// The first term of f: a point on the chosen emitter, joined to x_k by a shadow ray.
+    fn next_event(&self, paths: &mut Paths) {
+        let mis = self.columns.strategy() == EmitterStrategy::Mis;
+        for &lane in &paths.active {
+            let lane = lane as usize;
+            let state = &paths.states[lane];
+            if state.emitter_probability <= 0.0 || !self.bsdf_traits(state).smooth {
+                continue;
+            }
+            let emitter = self.scene.emitters()[state.emitter as usize].model();
+            let u = paths.pair(lane, Decision::Light);
+            let Some(light) = emitter.sample_direction(self.scene, state.si.p, u) else {
+                continue;
+            };
+            let wo = state.frame.to_local(light.d);
+            let (bsdf_value, p_bsdf) =
+                self.bsdf(state)
+                    .eval_pdf(self.shading_point(state), state.wi, wo);
+            let p_nee = state.emitter_probability * light.pdf;
+            let weight = if mis && !light.delta {
+                p_nee / (p_nee + p_bsdf)
+            } else {
+                1.0
+            };
+            let f = state.throughput * bsdf_value * light.radiance * (weight / p_nee);
+            if f == Rgb::ZERO {
+                continue;
+            }
+            let ray = match light.target {
+                Some(p) => state.si.spawn_ray_to(p),
+                None => state.si.spawn_ray(light.d),
+            };
+            if !self.scene.accel().occluded(&ray) {
+                paths.f_nee[lane] = f;
+            }
+        }
+    }
+
+    /// The second term of f: a BSDF-sampled ray from x_k that meets an emitter.
+    fn bsdf_rays(&self, paths: &mut Paths) {
+        for &lane in &paths.active {
+            let lane = lane as usize;
+            let state = &paths.states[lane];
+            let u = paths.pair(lane, Decision::BsdfRay);
+            let Some(sample) = self
+                .bsdf(state)
+                .sample(self.shading_point(state), state.wi, u)
+            else {
+                continue;
+            };
+            let throughput = state.throughput * sample.weight;
+            if throughput.max_element() <= 0.0 {
+                continue;
+            }
+            let d = state.frame.to_world(sample.wo);
+            let surface = self.scene.intersect(&state.si.spawn_ray(d));
+            let mut f = Rgb::ZERO;
+            let mut arrives = |e: usize| {
+                let emitter = self.scene.emitters()[e].model();
+                let radiance = emitter.eval(self.scene, d, surface.as_ref());
+                if radiance == Rgb::ZERO {
+                    return;
+                }
+                let weight = if sample.delta {
+                    1.0
+                } else {
+                    let p_nee = self.scene.emitter_choice().probability(e)
+                        * emitter.pdf_direction(self.scene, state.si.p, d, surface.as_ref());
+                    sample.pdf / (sample.pdf + p_nee)
+                };
+                f += throughput * radiance * weight;
+            };
+            match &surface {
+                Some(si) => {
+                    if let Some(e) = self.scene.common(si.shape as usize).emitter {
+                        arrives(e);
+                    }
+                }
+                None => self.scene.environments().iter().for_each(|&e| arrives(e)),
+            }
+            paths.f_bsdf[lane] = f;
+        }
+    }
+
+    /// Radiance that is not finite would spoil its pixel for good: dropped, and counted.
+    fn drop_non_finite(paths: &mut Paths) {
+        for &lane in &paths.active {
+            let lane = lane as usize;
+            if !(paths.f_nee[lane] + paths.f_bsdf[lane]).is_finite() {
+                paths.f_nee[lane] = Rgb::ZERO;
+                paths.f_bsdf[lane] = Rgb::ZERO;
+                paths.non_finite += 1;
+            }
+        }
+    }
+
+    fn record_contexts(&self, paths: &mut Paths, b: usize) {
+        if !paths.record {
+            return;
+        }
+        for i in 0..paths.active.len() {
+            let lane = paths.active[i] as usize;
+            paths.contexts[lane * self.columns.k() + b - 1] = self.context(paths, lane, b);
+        }
+    }
+
+    fn context(&self, paths: &Paths, lane: usize, bounce: usize) -> VertexContext {
+        let [width, height] = self.scene.film().crop_size().map(|n| n as f32);
+        let [x, y] = paths.film[lane];
+        let pixel = [x / width, y / height];
+        if bounce == 0 {
+            return VertexContext {
+                pixel,
+                ..Default::default()
+            };
+        }
+        let state = &paths.states[lane];
+        VertexContext {
+            position: state.si.p.to_array(),
+            normal: (state.si.shading_normal * 1f32.copysign(state.wi.z)).to_array(),
+            outgoing: (-Vec3::from_array(state.ray.dir)).to_array(),
+            pixel,
+            emitter: state.emitter,
+            bounce: bounce as u32,
+        }
+    }
+
+    #[inline]
+    fn bsdf(&self, state: &State) -> &'a crate::bsdf::Bsdf {
+        let id = self.scene.common(state.si.shape as usize).bsdf;
+        self.scene.materials().bsdf(id)
+    }
+
+    #[inline]
+    fn bsdf_traits(&self, state: &State) -> BsdfTraits {
+        self.scene
+            .traits(self.scene.common(state.si.shape as usize).bsdf)
+    }
+
+    #[inline]
+    fn shading_point(&self, state: &State) -> ShadingPoint<'a> {
+        ShadingPoint {
+            uv: state.si.uv,
+            materials: self.scene.materials(),
+        }
+    }
+}

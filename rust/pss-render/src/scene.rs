@@ -1,0 +1,253 @@
+//! The scene: everything checked once, then read by many threads.
+
+use embree4::{Device, Hit, Ray};
+
+use crate::bsdf::{Bsdf, Materials};
+use crate::description::{Array, Arrays, SCHEMA, SceneDescription, check, check_index, scene_hash};
+use crate::distribution::Discrete;
+use crate::emitter::{self, Emitter};
+use crate::error::SceneError;
+use crate::film::Film;
+use crate::interaction::Interaction;
+use crate::sensor::Sensor;
+use crate::shape::{Common, Shape};
+use crate::texture::Texture;
+
+/// Counts and sizes, for `pssflow info` and the statistics of a render.
+#[derive(Clone, Debug, Default, serde::Serialize)]
+pub struct Summary {
+    /// Triangles that can be hit.
+    pub triangles: usize,
+    /// Triangles without area, left out.
+    pub degenerate_triangles: usize,
+    /// Shapes by plugin.
+    pub shapes: std::collections::BTreeMap<String, usize>,
+    /// BSDFs by plugin.
+    pub bsdfs: std::collections::BTreeMap<String, usize>,
+    /// Emitters by plugin.
+    pub emitters: std::collections::BTreeMap<String, usize>,
+    /// Bytes of geometry held.
+    pub geometry_bytes: usize,
+    /// Bytes of textures held.
+    pub textures: usize,
+}
+
+/// A scene that can be traced. Send + Sync; nothing in it changes after it is built.
+pub struct Scene {
+    accel: embree4::Scene,
+    shapes: Vec<Shape>,
+    commons: Vec<Common>,
+    materials: Materials,
+    /// Per BSDF, so that the main loop does not ask twice.
+    traits: Vec<BsdfTraits>,
+    emitters: Vec<Emitter>,
+    environments: Vec<usize>,
+    emitter_choice: Discrete,
+    sensor: Sensor,
+    film: Film,
+    hash: String,
+}
+
+impl std::fmt::Debug for Scene {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Scene")
+            .field("hash", &self.hash)
+            .field("summary", &self.summary())
+            .finish()
+    }
+}
+
+/// What the main loop needs to know of a BSDF before it is evaluated.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct BsdfTraits {
+    pub(crate) transmits: bool,
+    pub(crate) smooth: bool,
+    pub(crate) anisotropic: bool,
+}
+
+impl Scene {
+    /// Builds a scene from its description (JSON, schema 1) and arrays, and its BVH on `device`.
+    ///
+    /// # Errors
+    /// [`SceneError`]; it names the shape, BSDF, emitter or texture, and the rule that it breaks.
+    pub fn new(description: &str, arrays: Vec<Array>, device: &Device) -> Result<Self, SceneError> {
+        let hash = scene_hash(description, &arrays);
+        let d: SceneDescription = serde_json::from_str(description)?;
+        if d.schema != SCHEMA {
+            return Err(SceneError::Schema {
+                found: d.schema,
+                expected: SCHEMA,
+            });
+        }
+        let mut arrays = Arrays::new(arrays);
+
+        let mut materials = Materials::default();
+        for texture in d.textures {
+            materials
+                .textures
+                .push(Texture::build(texture, &mut arrays)?);
+        }
+        for bsdf in d.bsdfs {
+            let bsdf = Bsdf::build(bsdf, &materials)?;
+            materials.bsdfs.push(bsdf);
+        }
+        let traits = materials.bsdfs.iter().map(|b| BsdfTraits {
+            transmits: b.transmits(&materials),
+            smooth: b.smooth(&materials),
+            anisotropic: b.anisotropic(&materials),
+        });
+        let traits = traits.collect();
+
+        if d.shapes.is_empty() {
+            return Err(SceneError::Empty);
+        }
+        let (mut shapes, mut commons) = (Vec::new(), Vec::new());
+        let mut builder = embree4::SceneBuilder::new(device)?;
+        for description in d.shapes {
+            let (common, shape) = Shape::build(description, &mut arrays)?;
+            let owner = format!("shape {:?}", common.id);
+            check_index(common.bsdf, materials.bsdfs.len(), &owner, "bsdf")?;
+            if let Some(e) = common.emitter {
+                check_index(e, d.emitters.len(), &owner, "emitter")?;
+            }
+            shape.model().attach(&mut builder)?;
+            shapes.push(shape);
+            commons.push(common);
+        }
+
+        for e in &d.emitters {
+            let weight = e.sampling_weight();
+            let owner = format!("emitter {:?}", e.id());
+            let ok = weight.is_finite() && weight >= 0.0;
+            check(
+                ok,
+                &owner,
+                "sampling_weight",
+                weight,
+                "finite and not negative",
+            )?;
+        }
+        let weights: Vec<f32> = d
+            .emitters
+            .iter()
+            .map(emitter::Description::sampling_weight)
+            .collect();
+        let mut emitters = Vec::new();
+        for e in d.emitters {
+            emitters.push(Emitter::build(
+                e,
+                emitter::Builder {
+                    textures: materials.textures.len(),
+                    shapes: shapes.len(),
+                },
+            )?);
+        }
+        let environments = (0..emitters.len())
+            .filter(|&i| emitters[i].model().is_environment())
+            .collect();
+
+        let film = Film::build(d.film)?;
+        Ok(Self {
+            accel: builder.commit()?,
+            shapes,
+            commons,
+            traits,
+            materials,
+            environments,
+            emitter_choice: Discrete::new(weights.into_iter()),
+            emitters,
+            sensor: Sensor::build(d.sensor, &film)?,
+            film,
+            hash,
+        })
+    }
+
+    /// Hash of description and arrays (hex).
+    pub fn hash(&self) -> &str {
+        &self.hash
+    }
+
+    /// The film.
+    pub fn film(&self) -> &Film {
+        &self.film
+    }
+
+    /// The camera.
+    pub fn sensor(&self) -> &Sensor {
+        &self.sensor
+    }
+
+    /// BSDFs and textures.
+    pub fn materials(&self) -> &Materials {
+        &self.materials
+    }
+
+    /// A shape's geometry.
+    pub fn shape(&self, i: usize) -> &Shape {
+        &self.shapes[i]
+    }
+
+    /// A shape's id, BSDF and emitter.
+    pub fn common(&self, i: usize) -> &Common {
+        &self.commons[i]
+    }
+
+    /// All emitters, in the description's (stable) order.
+    pub fn emitters(&self) -> &[Emitter] {
+        &self.emitters
+    }
+
+    /// Emitters that escaping rays see.
+    pub(crate) fn environments(&self) -> &[usize] {
+        &self.environments
+    }
+
+    /// The choice of an emitter by its sampling weight.
+    pub fn emitter_choice(&self) -> &Discrete {
+        &self.emitter_choice
+    }
+
+    pub(crate) fn traits(&self, bsdf: usize) -> BsdfTraits {
+        self.traits[bsdf]
+    }
+
+    /// The acceleration structure, for measurements of rays alone.
+    pub fn accel(&self) -> &embree4::Scene {
+        &self.accel
+    }
+
+    /// The surface at a hit.
+    #[inline]
+    pub fn interaction(&self, ray: &Ray, hit: &Hit) -> Interaction {
+        let mut si = self.shapes[hit.geom as usize].interaction(ray, hit);
+        si.shape = hit.geom;
+        si
+    }
+
+    /// The nearest surface along a ray.
+    #[inline]
+    pub fn intersect(&self, ray: &Ray) -> Option<Interaction> {
+        self.accel
+            .intersect(ray)
+            .map(|hit| self.interaction(ray, &hit))
+    }
+
+    /// Counts and sizes.
+    pub fn summary(&self) -> Summary {
+        let mut s = Summary::default();
+        for shape in &self.shapes {
+            s.triangles += shape.model().triangles();
+            s.degenerate_triangles += shape.model().degenerate();
+            s.geometry_bytes += shape.model().memory();
+            *s.shapes.entry(shape.name().to_owned()).or_default() += 1;
+        }
+        for b in &self.materials.bsdfs {
+            *s.bsdfs.entry(b.name().to_owned()).or_default() += 1;
+        }
+        for e in &self.emitters {
+            *s.emitters.entry(e.name().to_owned()).or_default() += 1;
+        }
+        s.textures = self.materials.textures.len();
+        s
+    }
+}

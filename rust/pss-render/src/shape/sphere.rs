@@ -1,0 +1,171 @@
+//! The sphere, exact; sampled by the cone that it subtends.
+
+use std::f32::consts::{PI, TAU};
+
+use embree4::{GeomId, Hit, Quadric, Ray, SceneBuilder};
+use glam::Vec2;
+use serde::Deserialize;
+
+use super::affine::Affine;
+use super::{ShapeModel, SurfaceSample, solid_angle_pdf};
+use crate::bsdf::BsdfId;
+use crate::description::{Arrays, check};
+use crate::error::SceneError;
+use crate::interaction::Interaction;
+use crate::math::{RAY_EPSILON, Vec3, safe_sqrt};
+use crate::warp::{square_to_uniform_sphere, uniform_cone_pdf};
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Description {
+    pub(super) id: String,
+    center: [f32; 3],
+    radius: f32,
+    #[serde(default)]
+    flip_normals: bool,
+    to_world: [f32; 16],
+    pub(super) bsdf: BsdfId,
+    pub(super) emitter: Option<usize>,
+}
+
+/// `sphere`
+#[derive(Debug)]
+pub struct Sphere {
+    center: Vec3,
+    radius: f32,
+    /// Turns texture coordinates with the shape.
+    map: Affine,
+    sign: f32,
+}
+
+impl Sphere {
+    pub(super) fn build(d: Description, _arrays: &mut Arrays) -> Result<Self, SceneError> {
+        let owner = format!("shape {:?}", d.id);
+        check(
+            d.radius.is_finite() && d.radius > 0.0,
+            &owner,
+            "radius",
+            d.radius,
+            "positive and finite",
+        )?;
+        crate::description::check_all_finite(&d.center, &owner, "center")?;
+        Ok(Self {
+            center: Vec3::from_array(d.center),
+            radius: d.radius,
+            map: Affine::new(&d.to_world, &owner)?,
+            sign: if d.flip_normals { -1.0 } else { 1.0 },
+        })
+    }
+
+    fn uv(local: Vec3) -> Vec2 {
+        let local = local.normalize();
+        let phi = local.y.atan2(local.x);
+        let phi = if phi < 0.0 { phi + TAU } else { phi };
+        // acos loses the poles; the half-chord does not.
+        let theta = 2.0 * (0.5 * (local - Vec3::Z).length()).min(1.0).asin();
+        Vec2::new(phi / TAU, theta / PI)
+    }
+
+    fn area_sample(&self, reference: Vec3, u: [f32; 2]) -> SurfaceSample {
+        let d = square_to_uniform_sphere(u);
+        let p = self.center + d * self.radius;
+        SurfaceSample {
+            p,
+            n: d * self.sign,
+            uv: Vec2::ZERO,
+            pdf: solid_angle_pdf(1.0 / self.area(), p - reference, d),
+        }
+    }
+}
+
+impl ShapeModel for Sphere {
+    fn attach(&self, builder: &mut SceneBuilder) -> Result<GeomId, SceneError> {
+        Ok(builder.quadric(Quadric::Sphere {
+            center: self.center.to_array(),
+            radius: self.radius,
+        })?)
+    }
+
+    fn interaction(&self, ray: &Ray, hit: &Hit) -> Interaction {
+        // Projected back onto the sphere: origin + t·d has the error of a distant origin.
+        let q = Vec3::from_array(ray.origin) + Vec3::from_array(ray.dir) * hit.t;
+        let out = (q - self.center).normalize();
+        let p = self.center + out * self.radius;
+        let local = self.map.inverse_point(p);
+        let n = out * self.sign;
+        Interaction {
+            p,
+            n,
+            shading_normal: n,
+            uv: Self::uv(local),
+            dp_du: self.map.vector(Vec3::new(-local.y, local.x, 0.0)) * TAU,
+            frame_flipped: false,
+            shape: 0,
+        }
+    }
+
+    fn area(&self) -> f32 {
+        4.0 * PI * self.radius * self.radius
+    }
+
+    fn sample_position(&self, u: [f32; 2]) -> (Vec3, Vec3, Vec2) {
+        let local = square_to_uniform_sphere(u);
+        let p = self.map.point(local);
+        (p, (p - self.center) / self.radius * self.sign, Self::uv(local))
+    }
+
+    fn sample_direction(&self, reference: Vec3, u: [f32; 2]) -> SurfaceSample {
+        let to_center = self.center - reference;
+        let distance_2 = to_center.length_squared();
+        let limit = self.radius * (1.0 - self.sign * RAY_EPSILON);
+        if distance_2 <= limit * limit {
+            return self.area_sample(reference, u);
+        }
+        let inverse_distance = 1.0 / distance_2.sqrt();
+        let sin_max = self.radius * inverse_distance;
+        let sin_max_2 = sin_max * sin_max;
+        let cos_max = safe_sqrt(1.0 - sin_max_2);
+        // Below 1.5° the difference of cosines cancels; its Taylor series does not.
+        let sin_2 = if sin_max_2 > 0.000_685_23 {
+            let c = 1.0 + (cos_max - 1.0) * u[0];
+            1.0 - c * c
+        } else {
+            sin_max_2 * u[0]
+        };
+        let cos_theta = safe_sqrt(1.0 - sin_2);
+        let cos_alpha =
+            sin_2 / sin_max + cos_theta * safe_sqrt(1.0 - sin_2 / sin_max_2);
+        let sin_alpha = safe_sqrt(1.0 - cos_alpha * cos_alpha);
+        let (sin_phi, cos_phi) = (TAU * u[1]).sin_cos();
+        let axis = to_center * -inverse_distance;
+        let (s, t) = mitsuba_basis(axis);
+        let d = s * (cos_phi * sin_alpha) + t * (sin_phi * sin_alpha) + axis * cos_alpha;
+        let p = self.center + d * self.radius;
+        SurfaceSample {
+            p,
+            n: d * self.sign,
+            uv: Vec2::ZERO,
+            pdf: if p == reference { 0.0 } else { uniform_cone_pdf(cos_max) },
+        }
+    }
+
+    fn pdf_direction(&self, reference: Vec3, p: Vec3, n: Vec3) -> f32 {
+        let sin_alpha = self.radius / (self.center - reference).length();
+        if sin_alpha < 1.0 - f32::EPSILON / 2.0 {
+            uniform_cone_pdf(safe_sqrt(1.0 - sin_alpha * sin_alpha))
+        } else {
+            solid_angle_pdf(1.0 / self.area(), p - reference, n)
+        }
+    }
+}
+
+/// The basis about a unit vector that Mitsuba uses where no uv frame is at hand (Duff et al. 2017).
+fn mitsuba_basis(n: Vec3) -> (Vec3, Vec3) {
+    let sign = 1.0f32.copysign(n.z);
+    let a = -1.0 / (sign + n.z);
+    let b = n.x * n.y * a;
+    (
+        Vec3::new(sign * n.x * n.x * a + 1.0, sign * b, -sign * n.x),
+        Vec3::new(b, n.y * n.y * a + sign, -n.y),
+    )
+}

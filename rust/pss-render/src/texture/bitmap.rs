@@ -1,0 +1,135 @@
+//! An image over uv (Mitsuba's `bitmap`): linear values, bilinear or nearest, three ways to wrap.
+
+use glam::Vec2;
+use serde::Deserialize;
+
+use super::TextureModel;
+use crate::description::{ArrayRef, Arrays, check_all_finite, check_finite};
+use crate::error::SceneError;
+use crate::math::{Rgb, luminance};
+
+#[derive(Clone, Copy, Debug, Deserialize, PartialEq, Eq)]
+#[serde(rename_all = "lowercase")]
+enum Wrap {
+    Repeat,
+    Mirror,
+    Clamp,
+}
+
+#[derive(Clone, Copy, Debug, Deserialize, PartialEq, Eq)]
+#[serde(rename_all = "lowercase")]
+enum Filter {
+    Nearest,
+    Bilinear,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Description {
+    #[serde(default)]
+    id: String,
+    data: ArrayRef,
+    to_uv: [f32; 9],
+    wrap: Wrap,
+    filter: Filter,
+    #[serde(default)]
+    #[allow(dead_code)]
+    mean: f32,
+}
+
+/// Pixels in rows from v = 0 downwards, as Mitsuba stores them; one or three channels.
+#[derive(Debug)]
+pub struct Bitmap {
+    data: Vec<f32>,
+    width: usize,
+    height: usize,
+    channels: usize,
+    /// First two rows of the 3×3 map uv → texture.
+    to_uv: [[f32; 3]; 2],
+    wrap: Wrap,
+    filter: Filter,
+}
+
+impl Bitmap {
+    pub(crate) fn build(d: Description, arrays: &mut Arrays) -> Result<Self, SceneError> {
+        let owner = format!("texture {:?}", d.id);
+        let (shape, data) = arrays.take_any_f32(d.data, &owner, "data")?;
+        let (height, width, channels) = match shape[..] {
+            [h, w, c] if h > 0 && w > 0 && (c == 1 || c == 3) && h * w * c == data.len() => {
+                (h, w, c)
+            }
+            _ => {
+                return Err(SceneError::Array {
+                    owner,
+                    name: "data",
+                    found: format!("shape {shape:?}"),
+                    expected: "(height, width, 1 or 3)".to_owned(),
+                });
+            }
+        };
+        check_finite(&data, channels, &owner, "data")?;
+        check_all_finite(&d.to_uv, &owner, "to_uv")?;
+        let m = d.to_uv;
+        Ok(Self {
+            data,
+            width,
+            height,
+            channels,
+            to_uv: [[m[0], m[1], m[2]], [m[3], m[4], m[5]]],
+            wrap: d.wrap,
+            filter: d.filter,
+        })
+    }
+
+    fn wrap(&self, i: i32, n: usize) -> usize {
+        let n = n as i32;
+        let wrapped = match self.wrap {
+            Wrap::Clamp => i.clamp(0, n - 1),
+            Wrap::Repeat => i.rem_euclid(n),
+            Wrap::Mirror => {
+                let j = i.rem_euclid(n);
+                if i.div_euclid(n) & 1 == 0 { j } else { n - 1 - j }
+            }
+        };
+        wrapped as usize
+    }
+
+    fn texel(&self, x: i32, y: i32) -> Rgb {
+        let i = self.wrap(y, self.height) * self.width + self.wrap(x, self.width);
+        if self.channels == 3 {
+            Rgb::new(self.data[3 * i], self.data[3 * i + 1], self.data[3 * i + 2])
+        } else {
+            Rgb::splat(self.data[i])
+        }
+    }
+}
+
+/// Texel coordinates stay far inside i32 for any finite uv.
+fn to_index(x: f32) -> i32 {
+    x.floor().clamp(-1e9, 1e9) as i32
+}
+
+impl TextureModel for Bitmap {
+    fn eval(&self, uv: Vec2) -> Rgb {
+        let [a, b] = self.to_uv;
+        let x = (a[0] * uv.x + a[1] * uv.y + a[2]) * self.width as f32;
+        let y = (b[0] * uv.x + b[1] * uv.y + b[2]) * self.height as f32;
+        match self.filter {
+            Filter::Nearest => self.texel(to_index(x), to_index(y)),
+            Filter::Bilinear => {
+                // Texel centres lie at half-integers.
+                let (x, y) = (x - 0.5, y - 0.5);
+                let (i, j) = (to_index(x), to_index(y));
+                let (fx, fy) = (x - x.floor(), y - y.floor());
+                let top = self.texel(i, j).lerp(self.texel(i + 1, j), fx);
+                let bottom = self.texel(i, j + 1).lerp(self.texel(i + 1, j + 1), fx);
+                top.lerp(bottom, fy)
+            }
+        }
+    }
+
+    fn eval_scalar(&self, uv: Vec2) -> f32 {
+        let value = self.eval(uv);
+        if self.channels == 1 { value.x } else { luminance(value) }
+    }
+}

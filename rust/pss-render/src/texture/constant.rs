@@ -1,0 +1,46 @@
+//! One colour everywhere (Mitsuba's `srgb`, `uniform` and plain values).
+
+use glam::Vec2;
+use serde::Deserialize;
+
+use super::TextureModel;
+use crate::description::{Arrays, check_all_finite};
+use crate::error::SceneError;
+use crate::math::{Rgb, luminance};
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Description {
+    #[serde(default)]
+    id: String,
+    value: [f32; 3],
+}
+
+/// A constant colour; a scalar is three equal channels.
+#[derive(Debug)]
+pub struct Constant {
+    value: Rgb,
+    scalar: f32,
+}
+
+impl Constant {
+    pub(crate) fn build(d: Description, _arrays: &mut Arrays) -> Result<Self, SceneError> {
+        check_all_finite(&d.value, &format!("texture {:?}", d.id), "value")?;
+        let [r, g, b] = d.value;
+        let value = Rgb::from_array(d.value);
+        let scalar = if r == g && g == b { r } else { luminance(value) };
+        Ok(Self { value, scalar })
+    }
+}
+
+impl TextureModel for Constant {
+    #[inline]
+    fn eval(&self, _uv: Vec2) -> Rgb {
+        self.value
+    }
+
+    #[inline]
+    fn eval_scalar(&self, _uv: Vec2) -> f32 {
+        self.scalar
+    }
+}

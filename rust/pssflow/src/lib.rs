@@ -1,0 +1,1 @@
+//! The estimator: pilot, fit, render; joins the tracer and the guides.
