@@ -1,0 +1,87 @@
+"""BSDFs. To add one: write a converter, and give it a row in `BSDFS`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from .textures import export_texture
+from .walk import SWITCH, Converter, Entry, Fields, Walk, number, printed, switch
+
+DISTRIBUTIONS = {"beckmann": "beckmann", "ggx": "ggx"}
+
+
+def export_bsdf(walk: Walk, obj: Any, where: str) -> int:
+    """Index of a BSDF in the description; those that it nests come before it."""
+    return walk.shared(BSDFS, "BSDF", obj, where)
+
+
+def _diffuse(walk: Walk, obj: Any, where: str) -> Entry:
+    return {"reflectance": _texture(walk, Fields(obj), where, "reflectance")}
+
+
+def _twosided(walk: Walk, obj: Any, where: str) -> Entry:
+    fields = Fields(obj)
+    return {
+        "front": export_bsdf(walk, fields["brdf_0"], f"{where}.brdf_0"),
+        "back": export_bsdf(walk, fields["brdf_1"], f"{where}.brdf_1"),
+    }
+
+
+def _blendbsdf(walk: Walk, obj: Any, where: str) -> Entry:
+    fields = Fields(obj)
+    return {
+        "weight": _texture(walk, fields, where, "weight"),
+        "first": export_bsdf(walk, fields["bsdf_0"], f"{where}.bsdf_0"),
+        "second": export_bsdf(walk, fields["bsdf_1"], f"{where}.bsdf_1"),
+    }
+
+
+def _roughplastic(walk: Walk, obj: Any, where: str) -> Entry:
+    fields, shown = Fields(obj), printed(obj)
+    diffuse_mean = number(fields["diffuse_reflectance"].mean(), "diffuse_reflectance")
+    specular_mean = 1.0
+    if "specular_reflectance" in fields:
+        specular_mean = number(fields["specular_reflectance"].mean(), "specular_reflectance")
+    # Mitsuba keeps this number to itself but renews it with every edit, from the same means.
+    total = diffuse_mean + specular_mean
+    return {
+        "distribution": switch(shown, "distribution", DISTRIBUTIONS),
+        "alpha": number(fields["alpha"], "alpha"),
+        "sample_visible": switch(shown, "sample_visible", SWITCH),
+        "nonlinear": switch(shown, "nonlinear", SWITCH),
+        "int_ior_over_ext_ior": number(fields["eta"], "eta"),
+        "diffuse_reflectance": _texture(walk, fields, where, "diffuse_reflectance"),
+        "specular_reflectance": _optional_texture(walk, fields, where, "specular_reflectance"),
+        "specular_sampling_weight": specular_mean / total if total > 0 else 0.5,
+    }
+
+
+def _roughconductor(walk: Walk, obj: Any, where: str) -> Entry:
+    fields, shown = Fields(obj), printed(obj)
+    isotropic = "alpha" in fields
+    return {
+        "distribution": switch(shown, "distribution", DISTRIBUTIONS),
+        "sample_visible": switch(shown, "sample_visible", SWITCH),
+        "alpha_u": _texture(walk, fields, where, "alpha" if isotropic else "alpha_u"),
+        "alpha_v": _texture(walk, fields, where, "alpha" if isotropic else "alpha_v"),
+        "eta": _texture(walk, fields, where, "eta"),
+        "k": _texture(walk, fields, where, "k"),
+        "specular_reflectance": _optional_texture(walk, fields, where, "specular_reflectance"),
+    }
+
+
+BSDFS: dict[str, Converter] = {
+    "SmoothDiffuse": Converter("diffuse", "diffuse", _diffuse),
+    "TwoSidedBRDF": Converter("twosided", "twosided", _twosided),
+    "BlendBSDF": Converter("blendbsdf", "blendbsdf", _blendbsdf),
+    "RoughPlastic": Converter("roughplastic", "roughplastic", _roughplastic),
+    "RoughConductor": Converter("roughconductor", "roughconductor", _roughconductor),
+}
+
+
+def _texture(walk: Walk, fields: Fields, where: str, name: str) -> int:
+    return export_texture(walk, fields[name], f"{where}.{name}")
+
+
+def _optional_texture(walk: Walk, fields: Fields, where: str, name: str) -> int | None:
+    return _texture(walk, fields, where, name) if name in fields else None

@@ -1,0 +1,147 @@
+"""Shapes, in an order that does not change from process to process.
+
+To add one: write a converter, and give it a row in `SHAPES`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .bsdfs import export_bsdf
+from .walk import (
+    Converter,
+    Entry,
+    Fields,
+    RefusedError,
+    Walk,
+    class_of,
+    matrix,
+    plugin_of,
+    printed,
+    rows,
+)
+
+
+def ordered_shapes(shapes: list[Any]) -> list[tuple[str, Any]]:
+    """(key, shape) of all shapes. Keys are unique, and the same for the same scene in each process.
+
+    A shape that has an id of its own keeps it. Mitsuba drops the ids of meshes that it merges, and their order in
+    `scene.shapes()` hangs on addresses: shapes without an id, or with one that others share, are sorted by what they
+    are.
+    """
+    counts = Counter(shape.id() for shape in shapes)
+    named = [shape for shape in shapes if shape.id() and counts[shape.id()] == 1]
+    others = [shape for shape in shapes if not (shape.id() and counts[shape.id()] == 1)]
+    named.sort(key=lambda shape: shape.id())
+    others.sort(key=_content)
+
+    listed = [(shape.id(), shape) for shape in named]
+    taken = {key for key, _ in listed}
+    used: Counter[str] = Counter()
+    for shape in others:
+        merged = " (merged)" if " + " in _mesh_name(shape) else ""
+        stem = shape.id() or _type_name(shape)
+        while (key := f"{stem}_{used[stem]}{merged}") in taken:
+            used[stem] += 1
+        used[stem] += 1
+        listed.append((key, shape))
+    return listed
+
+
+def export_shape(walk: Walk, key: str, shape: Any, emitter: int | None) -> None:
+    """Appends a shape's entry; a refused one leaves a line in `walk.unsupported` instead."""
+    walk.shape = key
+    entry = walk.convert(SHAPES, "shape", shape, key)
+    if entry is not None:
+        for medium in (shape.interior_medium(), shape.exterior_medium()):
+            if medium is not None:
+                walk.refuse("medium", plugin_of(medium), key)
+        bsdf = export_bsdf(walk, shape.bsdf(), f"{key}.bsdf")
+        walk.entries["shape"].append({**entry, "bsdf": bsdf, "emitter": emitter})
+    walk.shape = None
+
+
+def _mesh(walk: Walk, obj: Any, _where: str) -> Entry:
+    positions = rows(obj.vertex_positions_buffer(), 3, np.float32, "vertex_positions")
+    faces = rows(obj.faces_buffer(), 3, np.uint32, "faces")
+    normals = texcoords = None
+    if obj.has_vertex_normals():
+        normals = rows(obj.vertex_normals_buffer(), 3, np.float32, "vertex_normals")
+    if obj.has_vertex_texcoords():
+        texcoords = rows(obj.vertex_texcoords_buffer(), 2, np.float32, "vertex_texcoords")
+    for name, array in (("vertex_normals", normals), ("vertex_texcoords", texcoords)):
+        if array is not None and len(array) != len(positions):
+            raise RefusedError(f"has {len(array)} `{name}` for {len(positions)} positions")
+    return {
+        "positions": walk.add_array(positions),
+        "faces": walk.add_array(faces),
+        "normals": None if normals is None else walk.add_array(normals),
+        "texcoords": None if texcoords is None else walk.add_array(texcoords),
+        "flip_normals": bool(obj.has_flipped_normals()),
+    }
+
+
+def _placed(_walk: Walk, obj: Any, _where: str) -> Entry:
+    """Shapes that their transform says all about: rectangle, disk (whose transform holds its flip), cylinder."""
+    return {
+        "to_world": matrix(Fields(obj)["to_world"], "to_world"),
+        "flip_normals": bool(obj.has_flipped_normals()),
+    }
+
+
+def _sphere(walk: Walk, obj: Any, where: str) -> Entry:
+    placed = _placed(walk, obj, where)
+    to_world = np.reshape(placed["to_world"], (4, 4))
+    # As Mitsuba does: the first axis alone gives the radius, should the transform scale unevenly.
+    return {
+        "center": to_world[:3, 3].tolist(),
+        "radius": float(np.float32(np.linalg.norm(to_world[:3, 0]))),
+        **placed,
+    }
+
+
+SHAPES: dict[str, Converter] = {
+    "Mesh": Converter("mesh", "mesh", _mesh),
+    "OBJMesh": Converter("obj", "mesh", _mesh),
+    "PLYMesh": Converter("ply", "mesh", _mesh),
+    "SerializedMesh": Converter("serialized", "mesh", _mesh),
+    "BlenderMesh": Converter("blender", "mesh", _mesh),
+    "Cube": Converter("cube", "mesh", _mesh),
+    # A mesh too, but sampled as a rectangle: not triangle by triangle.
+    "Rectangle": Converter("rectangle", "rectangle", _placed),
+    "Sphere": Converter("sphere", "sphere", _sphere),
+    "Disk": Converter("disk", "disk", _placed),
+    "Cylinder": Converter("cylinder", "cylinder", _placed),
+}
+
+
+def _content(shape: Any) -> tuple[str, str, int, bytes, str]:
+    """What sorts shapes without an id: things that most edits leave alone come first."""
+    faces = 0
+    blocks: list[NDArray[Any]] = []
+    if class_of(shape) in SHAPES:
+        if shape.is_mesh():
+            faces = shape.face_count()
+            blocks.append(rows(shape.faces_buffer(), 1, np.uint32, "faces"))
+            blocks.append(rows(shape.vertex_positions_buffer(), 1, np.float32, "vertex_positions"))
+        else:
+            blocks.append(np.array(matrix(Fields(shape)["to_world"], "to_world")))
+    digest = hashlib.blake2b(digest_size=16)
+    for block in blocks:
+        digest.update(block)
+    return class_of(shape), _mesh_name(shape), faces, digest.digest(), str(shape.bsdf())
+
+
+def _mesh_name(shape: Any) -> str:
+    """File that a mesh came from, or the files that it was merged from; empty for other shapes."""
+    return printed(shape).get("name", "").strip('"') if shape.is_mesh() else ""
+
+
+def _type_name(shape: Any) -> str:
+    converter = SHAPES.get(class_of(shape))
+    return converter.type if converter else plugin_of(shape)

@@ -1,0 +1,1 @@
+"""The tests of pssflow; a package, so that they share `tests.scenes`."""

@@ -1,0 +1,41 @@
+"""Fixtures that all tests share: Mitsuba's variants and the folder of third-party scenes."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import mitsuba as mi
+import pytest
+
+SCALAR, LLVM = "scalar_rgb", "llvm_ad_rgb"
+
+
+@pytest.fixture(params=[SCALAR, LLVM])
+def variant(request: pytest.FixtureRequest) -> str:
+    """Runs the test once in each variant that pssflow supports."""
+    mi.set_variant(request.param)
+    return request.param
+
+
+@pytest.fixture
+def scalar_variant() -> str:
+    """Sets `scalar_rgb`, which needs no LLVM and compiles nothing."""
+    mi.set_variant(SCALAR)
+    return SCALAR
+
+
+@pytest.fixture
+def llvm_variant() -> str:
+    """Sets `llvm_ad_rgb`; a machine without libLLVM fails here, on purpose: see `make`'s notice about libllvm19."""
+    mi.set_variant(LLVM)
+    return LLVM
+
+
+@pytest.fixture(scope="session")
+def shared_scenes() -> Path:
+    """The folder of third-party scenes, from the environment variable PSSFLOW_SCENES; skips where there is none."""
+    folder = os.environ.get("PSSFLOW_SCENES")
+    if not folder or not Path(folder).is_dir():
+        pytest.skip("PSSFLOW_SCENES names no folder: third-party scenes are absent")
+    return Path(folder)
