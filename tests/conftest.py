@@ -1,13 +1,15 @@
-"""Fixtures that all tests share: Mitsuba's variants and the folder of third-party scenes."""
+"""Fixtures that all tests share: Mitsuba's variants, the folder of third-party scenes, and where pictures go."""
 
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 
 import mitsuba as mi
 import pytest
 
+ROOT = Path(__file__).resolve().parents[1]
 SCALAR, LLVM = "scalar_rgb", "llvm_ad_rgb"
 
 
@@ -39,3 +41,10 @@ def shared_scenes() -> Path:
     if not folder or not Path(folder).is_dir():
         pytest.skip("PSSFLOW_SCENES names no folder: third-party scenes are absent")
     return Path(folder)
+
+
+@pytest.fixture
+def artifacts(request: pytest.FixtureRequest) -> Path:
+    """Where a failing test leaves its pictures: `out/tests/artifacts/<test>`. Made by who writes there."""
+    name = re.sub(r"[^\w.-]+", "-", request.node.name).strip("-")
+    return ROOT / "out" / "tests" / "artifacts" / Path(request.node.path).stem / name

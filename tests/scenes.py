@@ -73,7 +73,7 @@ def furnace_sphere() -> Description:
             "type": "disk",
             "to_world": T()
             .translate([0.7, 0.3, -0.9])
-            .rotate([1, 0.5, 0], 25)
+            .rotate([0.8, 0.6, 0], 25)
             .scale([0.9, 0.6, 1]),
             "bsdf": _twosided(_diffuse(0.7, 0.5, 0.2)),
         },
@@ -179,7 +179,7 @@ def glossy_room() -> Description:
             "type": "rectangle",
             "to_world": T()
             .translate([-0.4, -0.2, 2.6])
-            .rotate([1, 0.2, 0], 170)
+            .rotate([0.96, 0.28, 0], 170)
             .scale([0.5, 0.4, 1]),
             "bsdf": _diffuse(0.0),
             "light": _area(6.0, 5.0, 4.0),

@@ -230,7 +230,8 @@ def _explain(unsupported: list[Unsupported]) -> str:
     named = "; ".join(groups[:NAMED_IN_ERROR])
     more = len(groups) - NAMED_IN_ERROR
     counted = f"; and {more} more, listed by `pssflow info`" if more > 0 else ""
-    kinds = dict.fromkeys(thing.kind for thing in unsupported if thing.kind in SUPPORTED)
+    unknown = dict.fromkeys(thing.kind for thing in unsupported if thing.reason is None)
+    kinds = [kind for kind in unknown if kind in SUPPORTED]
     supported = "; ".join(f"{kind}s: {', '.join(SUPPORTED[kind])}" for kind in kinds)
     hint = f" (supported {supported})" if supported else ""
     return f"{named}{counted}{hint}. Replace them in the scene, or render this scene with Mitsuba's `path`"

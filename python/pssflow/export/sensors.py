@@ -7,7 +7,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from .walk import Converter, Entry, Fields, RefusedError, Walk, class_of, matrix, number
+from .walk import Converter, Entry, Fields, RefusedError, Walk, class_of, is_scalar, matrix, number
 
 FILTER_SAMPLES = 1025
 """Samples of a reconstruction filter over [0, radius]: linear interpolation between them is exact to 1e-6."""
@@ -94,7 +94,7 @@ def _rfilter(rfilter: Any) -> Entry:
     """A filter by its values; they need not be normalised, as a film divides by their sum."""
     radius = number(rfilter.radius(), "radius")
     x = np.linspace(0, radius, FILTER_SAMPLES, dtype=np.float32)
-    if mi.variant().startswith("scalar"):
+    if is_scalar():
         table = np.array([rfilter.eval(float(position)) for position in x])
     else:
         table = np.array(rfilter.eval(mi.Float(x)))

@@ -20,11 +20,15 @@ from .walk import (
     RefusedError,
     Walk,
     class_of,
+    floats,
     matrix,
     plugin_of,
     printed,
     rows,
 )
+
+INVERSE_TOLERANCE = 1e-3
+"""Largest entry by which a transform times its inverse may miss the identity, scale factors aside."""
 
 
 def ordered_shapes(shapes: list[Any]) -> list[tuple[str, Any]]:
@@ -88,10 +92,20 @@ def _mesh(walk: Walk, obj: Any, _where: str) -> Entry:
 
 def _placed(_walk: Walk, obj: Any, _where: str) -> Entry:
     """Shapes that their transform says all about: rectangle, disk (whose transform holds its flip), cylinder."""
-    return {
-        "to_world": matrix(Fields(obj)["to_world"], "to_world"),
-        "flip_normals": bool(obj.has_flipped_normals()),
-    }
+    transform = Fields(obj)["to_world"]
+    to_world = matrix(transform, "to_world")
+    inverse_transpose = floats(transform.inverse_transpose, 16, "to_world")
+    linear = np.reshape(to_world, (4, 4))[:3, :3]
+    lengths = np.linalg.norm(linear, axis=0)
+    inverse = np.reshape(inverse_transpose, (4, 4))[:3, :3].T
+    # Mitsuba takes every rotation's inverse for its transpose, also about axes that are not of unit length.
+    product = (lengths[:, None] * inverse) @ (linear / np.where(lengths > 0, lengths, 1))
+    if np.abs(product - np.eye(3)).max() > INVERSE_TOLERANCE:
+        raise RefusedError(
+            "has a `to_world` whose inverse in Mitsuba is wrong, so that its normals are; "
+            "rotate about axes of length 1"
+        )
+    return {"to_world": to_world, "flip_normals": bool(obj.has_flipped_normals())}
 
 
 def _sphere(walk: Walk, obj: Any, where: str) -> Entry:
@@ -133,7 +147,7 @@ def _content(shape: Any) -> tuple[str, str, int, bytes, str]:
             blocks.append(np.array(matrix(Fields(shape)["to_world"], "to_world")))
     digest = hashlib.blake2b(digest_size=16)
     for block in blocks:
-        digest.update(block)
+        digest.update(block.data)
     return class_of(shape), _mesh_name(shape), faces, digest.digest(), str(shape.bsdf())
 
 

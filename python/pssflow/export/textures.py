@@ -22,6 +22,7 @@ from .walk import (
     RefusedError,
     Walk,
     floats,
+    is_scalar,
     matrix,
     number,
     printed,
@@ -111,7 +112,7 @@ class _Probe:
         uv = np.array(points, np.float64) / [width, height]
         uv = uv @ inverse[:2, :2].T + inverse[:2, 2]
 
-        if mi.variant().startswith("scalar"):
+        if is_scalar():
             values = np.array([self._look_up_one(u, v) for u, v in uv])
         else:
             si = dr.zeros(mi.SurfaceInteraction3f, len(points))
@@ -165,8 +166,9 @@ def _modes(texels: Texels, look_up: _Probe) -> tuple[str, str]:
     for axis in (1, 0):
         last = texels.shape[axis] - 1
         for differ in (
-            lambda d, axis=axis: d - np.take(d, [-1], axis),
-            lambda d, axis=axis: d - np.flip(d, axis),
+            lambda d, axis=axis: d - np.take(d, [-1], axis),  # repeat from clamp
+            lambda d, axis=axis: np.flip(d, axis) - np.take(d, [-1], axis),  # mirror from clamp
+            lambda d, axis=axis: d - np.flip(d, axis),  # repeat from mirror
         ):
             if found := _largest(texels, scale, differ, along=axis):
                 y, x = found

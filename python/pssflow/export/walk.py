@@ -173,6 +173,11 @@ def _collector_type() -> type:
     return Collector
 
 
+def is_scalar() -> bool:
+    """Whether the active variant is a scalar one, whose calls take one point at a time."""
+    return (mi.variant() or "").startswith("scalar")
+
+
 def class_of(obj: Any) -> str:
     """Name of an object's class without the storage type that templates append (`BitmapTextureImpl[uint8]`)."""
     return obj.class_name().partition("[")[0]
@@ -250,7 +255,7 @@ SWITCH: Mapping[str, bool] = {"0": False, "1": True, "false": False, "true": Tru
 
 def switch(pairs: Mapping[str, str], name: str, choices: Mapping[str, Choice]) -> Choice:
     """What a printed setting means; raises `RefusedError` where it is absent or has no meaning to us."""
-    value = pairs.get(name)
+    value = pairs.get(name, "nothing")
     if value not in choices:
         raise RefusedError(
             f"has `{name}` = {value}, expected one of {', '.join(choices)}; "

@@ -20,10 +20,6 @@ pub(crate) struct ArrayRef(usize);
 #[serde(deny_unknown_fields)]
 pub(crate) struct SceneDescription {
     pub(crate) schema: u32,
-    /// Mitsuba variant that the scene was loaded in; kept for messages.
-    #[serde(default)]
-    #[allow(dead_code)]
-    pub(crate) variant: String,
     pub(crate) textures: Vec<texture::Description>,
     pub(crate) bsdfs: Vec<bsdf::Description>,
     pub(crate) shapes: Vec<shape::Description>,
@@ -220,9 +216,9 @@ pub(crate) fn check_index(
 }
 
 /// Hash of everything that decides the image (hex): the guide of one scene is refused by another.
-pub(crate) fn scene_hash(description: &str, arrays: &[Array]) -> String {
+pub(crate) fn scene_hash(description: &serde_json::Value, arrays: &[Array]) -> String {
     let mut hasher = blake3::Hasher::new();
-    hasher.update(description.as_bytes());
+    hasher.update(description.to_string().as_bytes());
     let mut words = Vec::new();
     for array in arrays {
         let (tag, shape) = match array {

@@ -17,8 +17,6 @@ pub struct Interaction {
     pub uv: Vec2,
     /// ∂p/∂u, for anisotropic BSDFs.
     pub dp_du: Vec3,
-    /// Whether (∂p/∂u, ∂p/∂v) is a left-handed pair about the normal: the bitangent is then turned round.
-    pub frame_flipped: bool,
     /// Index of the shape.
     pub shape: u32,
 }
@@ -26,11 +24,7 @@ pub struct Interaction {
 impl Interaction {
     /// Mitsuba's shading frame, measured along ∂p/∂u.
     pub fn uv_frame(&self) -> Frame {
-        let mut frame = Frame::from_tangent(self.shading_normal, self.dp_du);
-        if self.frame_flipped {
-            frame.t = -frame.t;
-        }
-        frame
+        Frame::from_tangent(self.shading_normal, self.dp_du)
     }
 
     /// The point moved off the surface to `d`'s side, as Mitsuba does it.

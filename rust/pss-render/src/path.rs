@@ -130,11 +130,52 @@ pub struct Paths {
     pub contexts: Vec<VertexContext>,
     /// In: whether to record contexts.
     pub record: bool,
+    /// In and out: where to note every ray, for measuring them alone; `None` costs nothing.
+    pub rays: Option<RayLog>,
     /// Out: paths whose f was not finite and was set to zero.
     pub non_finite: u64,
     active: Vec<u32>,
     states: Vec<State>,
     stage_contexts: Vec<VertexContext>,
+}
+
+/// The rays of a block by the kind of query that they were sent through.
+#[derive(Clone, Debug, Default)]
+pub struct RayLog {
+    /// Camera rays, in coherent packets.
+    pub camera: Vec<Ray>,
+    /// Nearest hits, one by one.
+    pub next: Vec<Ray>,
+    /// Shadow rays.
+    pub shadow: Vec<Ray>,
+}
+
+impl RayLog {
+    /// Number of rays.
+    pub fn len(&self) -> usize {
+        self.camera.len() + self.next.len() + self.shadow.len()
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Sends them again, as [`Tracer::trace`] does, and returns how many met something.
+    pub fn replay(&self, accel: &embree4::Scene) -> u64 {
+        let mut met = 0;
+        let mut hits: [Option<Hit>; 16] = [None; 16];
+        for rays in self.camera.chunks(16) {
+            accel.intersect_packet16(rays, &mut hits[..rays.len()], true);
+            met += hits[..rays.len()].iter().flatten().count() as u64;
+        }
+        met += self
+            .next
+            .iter()
+            .filter(|ray| accel.intersect(ray).is_some())
+            .count() as u64;
+        met + self.shadow.iter().filter(|ray| accel.occluded(ray)).count() as u64
+    }
 }
 
 /// Where a path stands.
@@ -165,6 +206,7 @@ impl Paths {
             found: Vec::new(),
             contexts: Vec::new(),
             record: false,
+            rays: None,
             non_finite: 0,
             active: Vec::new(),
             states: Vec::new(),
@@ -220,6 +262,18 @@ impl Paths {
         self.film.clear();
         self.film.extend_from_slice(film);
         Ok(())
+    }
+
+    /// Film positions in [0, 1)² of a traced block that recorded its contexts.
+    pub fn pixels(&self) -> impl Iterator<Item = [f32; 2]> + '_ {
+        self.contexts
+            .chunks_exact(self.columns.k())
+            .map(|c| c[0].pixel)
+    }
+
+    /// The emitter that each path of a traced block chose.
+    pub fn emitters(&self) -> impl Iterator<Item = u32> + '_ {
+        self.states.iter().map(|s| s.emitter)
     }
 
     fn reset(&mut self) {
@@ -400,8 +454,11 @@ impl<'a> Tracer<'a> {
         let mut hits: [Option<Hit>; 16] = [None; 16];
         for start in (0..paths.active.len()).step_by(16) {
             let n = (paths.active.len() - start).min(16);
-            for i in 0..n {
-                rays[i] = paths.states[paths.active[start + i] as usize].ray;
+            for (ray, &lane) in rays.iter_mut().zip(&paths.active[start..start + n]) {
+                *ray = paths.states[lane as usize].ray;
+            }
+            if let Some(log) = &mut paths.rays {
+                log.camera.extend_from_slice(&rays[..n]);
             }
             self.scene
                 .accel()
@@ -420,9 +477,12 @@ impl<'a> Tracer<'a> {
 
     /// x_b for b > 1, ray by ray: packets do not help incoherent rays.
     fn next_vertices(&self, paths: &mut Paths) {
-        let states = &mut paths.states;
+        let (states, log) = (&mut paths.states, &mut paths.rays);
         paths.active.retain(|&lane| {
             let state = &mut states[lane as usize];
+            if let Some(log) = log {
+                log.next.push(state.ray);
+            }
             match self.scene.accel().intersect(&state.ray) {
                 Some(hit) => {
                     self.arrive(state, &hit);
@@ -542,6 +602,9 @@ impl<'a> Tracer<'a> {
                 Some(p) => state.si.spawn_ray_to(p),
                 None => state.si.spawn_ray(light.d),
             };
+            if let Some(log) = &mut paths.rays {
+                log.shadow.push(ray);
+            }
             if !self.scene.accel().occluded(&ray) {
                 paths.f_nee[lane] = f;
             }
@@ -565,7 +628,11 @@ impl<'a> Tracer<'a> {
                 continue;
             }
             let d = state.frame.to_world(sample.wo);
-            let surface = self.scene.intersect(&state.si.spawn_ray(d));
+            let ray = state.si.spawn_ray(d);
+            if let Some(log) = &mut paths.rays {
+                log.next.push(ray);
+            }
+            let surface = self.scene.intersect(&ray);
             let mut f = Rgb::ZERO;
             let mut arrives = |e: usize| {
                 let emitter = self.scene.emitters()[e].model();

@@ -1,14 +1,17 @@
 //! The scene: everything checked once, then read by many threads.
 
 use embree4::{Device, Hit, Ray};
+use serde::Deserialize;
 
 use crate::bsdf::{Bsdf, Materials};
+use crate::columns::EmitterStrategy;
 use crate::description::{Array, Arrays, SCHEMA, SceneDescription, check, check_index, scene_hash};
 use crate::distribution::Discrete;
 use crate::emitter::{self, Emitter};
 use crate::error::SceneError;
 use crate::film::Film;
 use crate::interaction::Interaction;
+use crate::math::Vec3;
 use crate::sensor::Sensor;
 use crate::shape::{Common, Shape};
 use crate::texture::Texture;
@@ -71,8 +74,13 @@ impl Scene {
     /// # Errors
     /// [`SceneError`]; it names the shape, BSDF, emitter or texture, and the rule that it breaks.
     pub fn new(description: &str, arrays: Vec<Array>, device: &Device) -> Result<Self, SceneError> {
-        let hash = scene_hash(description, &arrays);
-        let d: SceneDescription = serde_json::from_str(description)?;
+        let mut description: serde_json::Value = serde_json::from_str(description)?;
+        // The same scene loaded in another Mitsuba variant is the same scene.
+        if let Some(fields) = description.as_object_mut() {
+            fields.remove("variant");
+        }
+        let hash = scene_hash(&description, &arrays);
+        let d = SceneDescription::deserialize(description)?;
         if d.schema != SCHEMA {
             return Err(SceneError::Schema {
                 found: d.schema,
@@ -230,6 +238,27 @@ impl Scene {
         self.accel
             .intersect(ray)
             .map(|hit| self.interaction(ray, &hit))
+    }
+
+    /// Light drawn from emitter `i` towards a point; `None` where there is none.
+    pub fn sample_emitter(
+        &self,
+        i: usize,
+        reference: Vec3,
+        u: [f32; 2],
+    ) -> Option<emitter::EmitterSample> {
+        self.emitters[i]
+            .model()
+            .sample_direction(self, reference, u)
+    }
+
+    /// What the emitter strategy `auto` means for this scene, and why.
+    pub fn auto_strategy(&self) -> (EmitterStrategy, &'static str) {
+        if self.emitters.iter().any(Emitter::can_be_hit) {
+            (EmitterStrategy::Mis, "a ray can hit an emitter")
+        } else {
+            (EmitterStrategy::Nee, "no ray can hit an emitter")
+        }
     }
 
     /// Counts and sizes.

@@ -1,1 +1,31 @@
-//! The estimator: pilot, fit, render; joins the tracer and the guides.
+//! The estimator: pilot → fit → render.
+//!
+//! I ≈ Σ over passes and samples of f(u) ÷ m(u), u ~ m, m = a + (1 − a)·q: random paths first (the pilot),
+//! from which a guide q is learned, then paths from the mixture of the guide and uniform numbers. The pilot
+//! stays in the image, with weights fixed by the sample counts. Start reading at [`render`].
+//!
+//! This crate joins the tracer (`pss-render`, which knows no guides) and the guides (`pss-guide`, which know
+//! no rays). It knows no Python.
+
+mod error;
+mod estimator;
+mod mixture;
+mod numbers;
+mod options;
+pub mod output;
+mod pass;
+mod progress;
+mod statistics;
+mod trace;
+
+pub use error::RenderError;
+pub use estimator::{Outcome, Seconds, render};
+pub use mixture::Mixture;
+pub use options::{Budget, GuideChoice, Learner, Options, PassKind, PassPlan};
+pub use pass::{PassContext, PilotRecords};
+pub use progress::{Phase, Progress, Silent};
+pub use statistics::{Counts, Statistics};
+pub use trace::{RayTiming, rays_alone, trace_blocks, uniform_paths};
+
+pub use pss_guide;
+pub use pss_render;

@@ -44,6 +44,16 @@ impl Materials {
         &self.bsdfs[id]
     }
 
+    /// Number of BSDFs, nested ones included.
+    pub fn bsdfs(&self) -> usize {
+        self.bsdfs.len()
+    }
+
+    /// Number of textures.
+    pub fn textures(&self) -> usize {
+        self.textures.len()
+    }
+
     /// A texture of the scene.
     #[inline]
     pub fn texture(&self, id: TextureId) -> &Texture {

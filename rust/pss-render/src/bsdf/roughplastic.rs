@@ -38,7 +38,7 @@ pub struct RoughPlastic {
     specular_reflectance: Option<TextureId>,
     specular_sampling_weight: f32,
     /// Share of light let in through the rough interface, over cos θ in equal steps.
-    external_transmittance: [f32; RESOLUTION],
+    external_transmittance: Box<[f32; RESOLUTION]>,
     /// Share of diffuse light inside that the interface throws back.
     internal_reflectance: f32,
 }
@@ -68,7 +68,9 @@ impl RoughPlastic {
             diffuse_reflectance: b.texture(d.diffuse_reflectance)?,
             specular_reflectance: b.optional(d.specular_reflectance)?,
             specular_sampling_weight: weight,
-            external_transmittance: std::array::from_fn(|i| tabulated.transmittance(node(i), eta)),
+            external_transmittance: Box::new(std::array::from_fn(|i| {
+                tabulated.transmittance(node(i), eta)
+            })),
             internal_reflectance: internal / RESOLUTION as f32 * 2.0,
         })
     }

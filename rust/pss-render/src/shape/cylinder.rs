@@ -73,7 +73,6 @@ impl ShapeModel for Cylinder {
             shading_normal: n,
             uv: Self::uv(local),
             dp_du,
-            frame_flipped: false,
             shape: 0,
         }
     }

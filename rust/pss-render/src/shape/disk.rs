@@ -71,7 +71,6 @@ impl ShapeModel for Disk {
             shading_normal: self.normal,
             uv: Self::uv(local.x, local.y),
             dp_du: self.map.vector(Vec3::new(cos_phi, sin_phi, 0.0)),
-            frame_flipped: false,
             shape: 0,
         }
     }

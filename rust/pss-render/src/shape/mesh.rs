@@ -162,15 +162,15 @@ impl ShapeModel for Mesh {
             }
             None => n,
         };
-        let (uv, dp_du, frame_flipped) = match &self.texcoords {
+        let (uv, dp_du) = match &self.texcoords {
             Some(texcoords) => {
                 let [t0, t1, t2] = face.map(|i| texcoord(texcoords, i));
                 let (d1, d2) = (t1 - t0, t2 - t0);
                 let det = d1.perp_dot(d2);
                 let dp_du = if det == 0.0 { Vec3::ZERO } else { (e1 * d2.y - e2 * d1.y) / det };
-                (t0 * b[0] + t1 * b[1] + t2 * b[2], dp_du, det < 0.0)
+                (t0 * b[0] + t1 * b[1] + t2 * b[2], dp_du)
             }
-            None => (Vec2::new(b[1], b[2]), e1, false),
+            None => (Vec2::new(b[1], b[2]), e1),
         };
         Interaction {
             p: p0 * b[0] + p1 * b[1] + p2 * b[2],
@@ -178,7 +178,6 @@ impl ShapeModel for Mesh {
             shading_normal,
             uv,
             dp_du,
-            frame_flipped,
             shape: 0,
         }
     }

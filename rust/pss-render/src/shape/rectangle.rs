@@ -36,24 +36,27 @@ pub struct Rectangle {
 impl Rectangle {
     pub(super) fn build(d: Description, _arrays: &mut Arrays) -> Result<Self, SceneError> {
         let map = Affine::new(&d.to_world, &format!("shape {:?}", d.id))?;
-        let corners = [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)];
         let sign = if d.flip_normals { -1.0 } else { 1.0 };
-        // The normal is the image of +z, also where the map mirrors and turns the triangles round.
+        // The shading normal is the image of +z, whatever the map does to the triangles' winding.
         let normal = map.normal(Vec3::Z);
-        let mirrored = map.to_world.matrix3.determinant() < 0.0;
-        let faces = if mirrored { vec![0, 2, 1, 2, 0, 3] } else { vec![0, 1, 2, 2, 3, 0] };
-        let positions = corners
-            .iter()
-            .flat_map(|&(x, y)| map.point(Vec3::new(x, y, 0.0)).to_array())
-            .collect();
-        let texcoords = corners
-            .iter()
-            .flat_map(|&(x, y)| [0.5 * (x + 1.0), 0.5 * (y + 1.0)])
-            .collect();
+        let corners = [[-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]];
+        let flat = |f: &dyn Fn([f32; 2]) -> Vec3| -> Vec<f32> {
+            corners.iter().flat_map(|&c| f(c).to_array()).collect()
+        };
+        let positions = flat(&|[x, y]| map.point(Vec3::new(x, y, 0.0)));
+        let normals = flat(&|_| normal);
+        let texcoords = corners.iter().flatten().map(|x| 0.5 * (x + 1.0)).collect();
         Ok(Self {
             map,
             normal: normal * sign,
-            mesh: Mesh::new(positions, faces, None, Some(texcoords), d.flip_normals, false),
+            mesh: Mesh::new(
+                positions,
+                vec![1, 2, 0, 1, 3, 2],
+                Some(normals),
+                Some(texcoords),
+                d.flip_normals,
+                false,
+            ),
         })
     }
 }

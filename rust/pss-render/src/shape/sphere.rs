@@ -99,7 +99,6 @@ impl ShapeModel for Sphere {
             shading_normal: n,
             uv: Self::uv(local),
             dp_du: self.map.vector(Vec3::new(-local.y, local.x, 0.0)) * TAU,
-            frame_flipped: false,
             shape: 0,
         }
     }

@@ -6,7 +6,7 @@ use serde::Deserialize;
 use super::TextureModel;
 use crate::description::{Arrays, check_all_finite};
 use crate::error::SceneError;
-use crate::math::{Rgb, luminance};
+use crate::math::Rgb;
 
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -26,10 +26,11 @@ pub struct Constant {
 impl Constant {
     pub(crate) fn build(d: Description, _arrays: &mut Arrays) -> Result<Self, SceneError> {
         check_all_finite(&d.value, &format!("texture {:?}", d.id), "value")?;
-        let [r, g, b] = d.value;
-        let value = Rgb::from_array(d.value);
-        let scalar = if r == g && g == b { r } else { luminance(value) };
-        Ok(Self { value, scalar })
+        Ok(Self {
+            value: Rgb::from_array(d.value),
+            // As Mitsuba: the channels' average for one colour, but the luminance for a bitmap's.
+            scalar: d.value.iter().sum::<f32>() / 3.0,
+        })
     }
 }
 

@@ -14,7 +14,7 @@ pub type TextureId = usize;
 pub(crate) trait TextureModel {
     /// The colour at `uv`.
     fn eval(&self, uv: Vec2) -> Rgb;
-    /// The scalar at `uv`: Mitsuba's `eval_1` (luminance of a colour).
+    /// The scalar at `uv`: Mitsuba's `eval_1`.
     fn eval_scalar(&self, uv: Vec2) -> f32;
 }
 
@@ -48,7 +48,7 @@ macro_rules! registry {
                 match self { $(Self::$variant(t) => t.eval(uv),)* }
             }
 
-            /// The scalar at `uv` (Mitsuba's `eval_1`: the luminance of a colour).
+            /// The scalar at `uv` (Mitsuba's `eval_1`).
             #[inline]
             pub fn eval_scalar(&self, uv: Vec2) -> f32 {
                 match self { $(Self::$variant(t) => t.eval_scalar(uv),)* }

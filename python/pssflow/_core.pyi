@@ -1,0 +1,140 @@
+"""Types of the extension module: the Rust core. Shapes and units are stated where they are not obvious.
+
+Errors: a wrong argument is a `ValueError`, a missing file a `FileNotFoundError`, a file that cannot be
+written an `OSError`, a failure of a library a `RuntimeError`, Ctrl-C a `KeyboardInterrupt`; always one line.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+__version__: str
+
+F32 = NDArray[np.float32]
+
+class ForeignGuide(Protocol):
+    """Any Python object with these methods works as a guide (see `pssflow.guide`)."""
+
+    def fit(self, u: F32, f: F32, g: F32, zeros: int, seed: int) -> None: ...
+    def sample(self, n: int, seed: int) -> tuple[F32, F32]: ...
+    def log_prob(self, u: F32) -> F32: ...
+
+class Guide:
+    """A fitted density on the cube of primary numbers."""
+
+    @staticmethod
+    def fit(
+        name: str,
+        u: F32,
+        f: F32,
+        *,
+        f_max: F32 | None = None,
+        g: F32 | None = None,
+        zeros: int = 0,
+        options: str = "{}",
+        seed: int = 0,
+        progress: Callable[[str, float], None] | None = None,
+    ) -> Guide:
+        """Fits guide `name` to numbers `u` (n, d) with contributions `f` (n,) drawn from density `g` (n,)."""
+    @staticmethod
+    def load(path: str, columns_hash: str | None = None, scene_hash: str | None = None) -> Guide: ...
+    def save(self, path: str, columns_hash: str, scene_hash: str) -> None: ...
+    def sample(self, n: int, seed: int = 0) -> tuple[F32, F32]:
+        """Draws (n, d) numbers and their log-density (n,); -inf is never returned for a drawn row."""
+    def log_prob(self, u: F32) -> F32:
+        """Log-density of rows u (n, d), shape (n,)."""
+    @property
+    def name(self) -> str: ...
+    @property
+    def dims(self) -> int: ...
+    @property
+    def parameters(self) -> int: ...
+    @property
+    def mass_outside(self) -> float: ...
+    def describe(self) -> str:
+        """JSON: configuration and training."""
+
+class Scene:
+    """A scene that can be traced, built from `pssflow.export`."""
+
+    def __init__(
+        self, description: str, arrays: Sequence[NDArray[Any]], search_dirs: Sequence[str] = (), threads: int = 0
+    ) -> None: ...
+    @property
+    def hash(self) -> str: ...
+    @property
+    def width(self) -> int:
+        """Columns of the crop."""
+    @property
+    def height(self) -> int: ...
+    @property
+    def embree(self) -> str:
+        """Version and path of the library in use."""
+    def summary(self) -> str:
+        """JSON: counts of shapes, BSDFs, emitters; triangles, degenerate_triangles, geometry_bytes."""
+    def columns(self, k: int, emitter_strategy: str) -> list[str]: ...
+    def columns_hash(self, k: int, parametrisation: str) -> str: ...
+    def auto_strategy(self) -> tuple[str, str]:
+        """What `emitter_strategy="auto"` means here, and why."""
+    def trace(
+        self,
+        u: F32,
+        pixels: F32,
+        *,
+        k: int,
+        parametrisation: str,
+        emitter_strategy: str,
+        threads: int = 0,
+    ) -> dict[str, NDArray[Any]]:
+        """u (n, 2k+1 or 2k+3), pixels (n, 2) film positions in pixels from the crop's corner.
+
+        Returns f (n,3), f_nee (n,3), f_bsdf (n,3), found (n,) bool, position/normal/outgoing (n,k,3),
+        pixel (n,2) in [0,1)², emitter (n,) uint32.
+        """
+    def pilot(
+        self, *, spp: int, k: int, parametrisation: str, emitter_strategy: str, seed: int = 0, threads: int = 0
+    ) -> dict[str, NDArray[Any]]:
+        """All uniform paths of `spp` samples a pixel: u (n,2k+1 or 2k+3), pixels (n,2), g (n,), and trace's keys."""
+    def render(
+        self,
+        options: str,
+        guide: Guide | ForeignGuide | None = None,
+        progress: Callable[[str, float], None] | None = None,
+    ) -> dict[str, Any]:
+        """Renders. `options` is JSON:
+
+        {"guide": "none" | name of the registry | "ready" (the fitted `guide`) | "foreign" (the object `guide`),
+         "guide_options": {...}, "k": 2, "parametrisation": "bsdf|cosine|uniform",
+         "emitter_strategy": "mis|nee", "spp": N or null, "time": seconds or null,
+         "replay": [{"kind": "pilot|guided|uniform", "spp": n}, ...] or null,
+         "uniform_fraction": a or null, "pilot_spp": n or null, "keep_pilot": true, "seed": 0, "threads": 0}
+
+        Returns image (h,w,3), variance (h,w,3) [variance of the mean], and "record": JSON string with
+        {"chosen", "a", "k", "parametrisation", "emitter_strategy", "seed", "threads", "camera_rays", "paths_found",
+         "nonzero", "nonzero_share", "outside", "non_finite", "pilot": {same counts}, "mean": [r,g,b],
+         "variance": relMSE's formula with the own variance of the mean, "max_weight", "max_contribution", "ess",
+         "passes": [{"kind","spp"}], "notes": [str], "training": {...}, "seconds": {"pilot","fit","render"}},
+        and "guide": Guide | None.
+        """
+    # For parity tests: values of single plugins.
+    def ray_intersect(self, origins: F32, directions: F32) -> dict[str, NDArray[Any]]:
+        """Per ray: valid (n,), p, n, sh_n (n,3), uv (n,2), shape (n,) index, sh_s (n,3) uv-frame tangent."""
+    def bsdf_eval_pdf(self, bsdf: int, uv: F32, wi: F32, wo: F32) -> tuple[F32, F32]:
+        """Local directions (z = normal): value·cos (n,3) and pdf (n,)."""
+    def bsdf_sample(self, bsdf: int, uv: F32, wi: F32, u: F32) -> tuple[F32, F32, F32]:
+        """wo (n,3), weight (n,3), pdf (n,); pdf 0 where nothing was sampled."""
+    def texture_eval(self, texture: int, uv: F32) -> F32: ...
+    def emitter_sample(self, emitter: int, reference: F32, u: F32) -> dict[str, NDArray[Any]]:
+        """d (n,3), radiance (n,3), pdf (n,) (0: none), p (n,3)."""
+    def film_ray(self, pixels: F32) -> tuple[F32, F32]:
+        """Origins and directions of camera rays through film positions."""
+    def rays_alone(self, *, spp: int, k: int, threads: int = 0) -> dict[str, float]:
+        """Times only the Embree queries that rendering makes: {"seconds", "rays", "rays_per_path"}."""
+
+def guides() -> str:
+    """JSON list of the registry: [{"name", "summary", "options": {default options}}]."""
+
+def write_exr(path: str, layers: dict[str, F32]) -> None:
+    """Writes layers (name -> (h,w,3)) as one-part f32 EXR with dotted channel names; key "" is the image."""

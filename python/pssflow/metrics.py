@@ -1,0 +1,187 @@
+"""Errors of images against a truth.
+
+relMSE = mean over pixels and channels of (x − r)²/(r² + ε), ε = (0.1 · mean r)², minus the truth's own relative variance,
+mean of var(r)/(r² + ε): a noisy truth adds its variance to every squared difference. Since a few fireflies can decide a
+mean, it is always reported with and without the worst 0.1 % of the pixels.
+
+Images are (H, W, 3) radiance in W·sr⁻¹·m⁻² (any last axis works). Sums are in double precision. Nothing here knows Mitsuba.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = [
+    "EPSILON",
+    "TRIMMED",
+    "Estimate",
+    "epsilon",
+    "finite_or_none",
+    "mean_and_error",
+    "relative_error",
+    "relative_variance",
+    "relmse",
+    "relmse_trimmed",
+    "relmse_with_error",
+]
+
+EPSILON = 0.1
+"""Share of the truth's mean below which a pixel's error counts as if the pixel had that radiance."""
+
+TRIMMED = 0.001
+"""Share of the pixels, the worst ones, that the trimmed relMSE leaves out."""
+
+F64 = NDArray[np.float64]
+
+
+class Estimate(NamedTuple):
+    """A number with its standard error."""
+
+    value: float
+    error: float
+
+
+def epsilon(reference: ArrayLike) -> float:
+    """ε = (0.1 · mean r)² of a truth; 0 for a black one."""
+    return float((EPSILON * np.mean(np.asarray(reference, np.float64))) ** 2)
+
+
+def relmse(
+    image: ArrayLike, reference: ArrayLike, reference_variance: ArrayLike | None = None
+) -> float:
+    """Relative mean squared error of `image` against `reference`, both (H, W, 3).
+
+    Args:
+        image: the estimate.
+        reference: the truth.
+        reference_variance: the truth's own variance of the mean, of the same shape; None for an exact truth.
+
+    Returns:
+        The error; slightly negative where it drowns in the truth's noise. Against a black truth: 0 for a black image,
+        else infinity.
+
+    Raises:
+        ValueError: shapes differ, or a value is not finite.
+
+    Examples:
+        >>> relmse([[[1.1, 0.9, 1.0]]], [[[1.0, 1.0, 1.0]]]) * 3 * 1.01
+        0.0200...
+    """
+    return _mean_of_worst_removed(_pixels(image, reference, reference_variance), 0.0)
+
+
+def relmse_trimmed(
+    image: ArrayLike,
+    reference: ArrayLike,
+    reference_variance: ArrayLike | None = None,
+    *,
+    fraction: float = TRIMMED,
+) -> float:
+    """relMSE without the `fraction` of pixels where it is largest: at least one is left out, and at least one left.
+
+    Raises:
+        ValueError: as `relmse`, or `fraction` lies outside [0, 1).
+    """
+    if not 0.0 <= fraction < 1.0:
+        raise ValueError(f"`fraction` = {fraction} lies outside [0, 1)")
+    return _mean_of_worst_removed(_pixels(image, reference, reference_variance), fraction)
+
+
+def relmse_with_error(
+    image: ArrayLike, reference: ArrayLike, reference_variance: ArrayLike | None = None
+) -> Estimate:
+    """relMSE of one image and its standard error, from the spread between pixels.
+
+    That holds as far as pixels are independent: wide reconstruction filters correlate neighbours, so that the error is
+    too small by up to the filter's area in pixels under a root. With several seeds use `mean_and_error`.
+    """
+    errors = _pixels(image, reference, reference_variance)
+    value = float(errors.mean())
+    return Estimate(value, _standard_error(errors))
+
+
+def relative_variance(variance: ArrayLike, reference: ArrayLike) -> float:
+    """Mean over pixels and channels of variance/(r² + ε): relMSE's formula with a variance of the mean.
+
+    With a truth's own variance it is what `relmse` subtracts; with an estimate's variance it predicts that estimate's
+    relMSE. 0 where both are black, infinity for a variance about a black truth.
+
+    Raises:
+        ValueError: shapes differ, or a value is not finite.
+    """
+    r, v = _checked(reference, "reference"), _checked(variance, "variance")
+    _same_shape(v, r, "variance")
+    return float(_divide(v, r * r + epsilon(r)).mean())
+
+
+def relative_error(variance: ArrayLike, reference: ArrayLike) -> float:
+    """Relative standard error of an image: the root of `relative_variance`."""
+    return math.sqrt(relative_variance(variance, reference))
+
+
+def mean_and_error(values: Sequence[float]) -> Estimate:
+    """Mean of independent values, as of several seeds, and its standard error; NaN for the error of a single one."""
+    array = np.asarray(values, np.float64)
+    if array.size == 0:
+        raise ValueError("`values` is empty; a mean needs at least one")
+    return Estimate(float(array.mean()), _standard_error(array))
+
+
+def finite_or_none(value: float) -> float | None:
+    """The value, or None where JSON has no number for it."""
+    return value if math.isfinite(value) else None
+
+
+def _pixels(image: ArrayLike, reference: ArrayLike, variance: ArrayLike | None) -> F64:
+    """Each pixel's share of the error, mean over its channels, flat."""
+    x, r = _checked(image, "image"), _checked(reference, "reference")
+    _same_shape(x, r, "image")
+    floor = r * r + epsilon(r)
+    errors = _divide((x - r) ** 2, floor)
+    if variance is not None and floor.any():
+        v = _checked(variance, "reference_variance")
+        _same_shape(v, r, "reference_variance")
+        errors = errors - _divide(v, floor)
+    return errors.reshape(-1, errors.shape[-1]).mean(axis=1)
+
+
+def _mean_of_worst_removed(errors: F64, fraction: float) -> float:
+    drop = min(math.ceil(fraction * errors.size), errors.size - 1)
+    if drop == 0:
+        return float(errors.mean())
+    return float(np.partition(errors, errors.size - drop)[: errors.size - drop].mean())
+
+
+def _divide(numerator: F64, denominator: F64) -> F64:
+    """A ratio that is 0 for 0/0 and infinite for x/0, without a warning: black truths are legal."""
+    limit = np.where(numerator > 0.0, math.inf, 0.0)
+    return np.divide(numerator, denominator, out=limit, where=denominator > 0.0)
+
+
+def _standard_error(values: F64) -> float:
+    if values.size < 2 or not np.isfinite(values).all():
+        return math.nan
+    return float(values.std(ddof=1) / math.sqrt(values.size))
+
+
+def _checked(values: Any, name: str) -> F64:
+    array = np.asarray(values, np.float64)
+    if array.size == 0 or array.ndim == 0:
+        raise ValueError(f"`{name}` is empty; expected an image (H, W, 3)")
+    bad = array.size - int(np.count_nonzero(np.isfinite(array)))
+    if bad:
+        raise ValueError(f"`{name}` has {bad} values of {array.size} that are not finite")
+    return array
+
+
+def _same_shape(array: F64, reference: F64, name: str) -> None:
+    if array.shape != reference.shape:
+        raise ValueError(
+            f"`{name}` has shape {array.shape}, the reference {reference.shape}; "
+            "compare images of one film size and crop"
+        )

@@ -1,0 +1,213 @@
+"""The whole estimator: a scene in, its k-bounce indirect light out. Start reading at `render`."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import _core, metrics
+from .guide import Choice, ForeignGuide, Guide, choose
+from .options import Plan, read_replay
+from .progress import Progress, reporting
+from .scene import Pilot, Scene, SceneLike, Trace
+
+if TYPE_CHECKING:
+    from .reference import Reference
+
+__all__ = ["Pilot", "Result", "Scene", "Trace", "render"]
+
+F32 = NDArray[np.float32]
+
+Replay = str | os.PathLike[str] | Mapping[str, Any] | Sequence[Mapping[str, Any]]
+"""A run's statistics, the JSON file that holds them, or only its list `passes`."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """A rendered image and how it came about."""
+
+    image: F32
+    """k-bounce radiance of the crop, (H, W, 3), W·sr⁻¹·m⁻², linear sRGB."""
+    variance: F32
+    """Variance of each mean, (H, W, 3), estimated from the same samples."""
+    stats: dict[str, Any]
+    """The run as one JSON object, what the command's `--json` prints: counts, weights, passes, seconds."""
+    timings: dict[str, float]
+    """Seconds: `load`, `export`, `bvh`, `pilot`, `fit`, `render`."""
+    guide: Guide | ForeignGuide | None
+    """The guide that drew the paths; None for random numbers."""
+
+    @property
+    def notes(self) -> list[str]:
+        """What is worth knowing, a line each: why the image is black, why the guide was not used."""
+        return self.stats["notes"]
+
+    def measure(self, reference: Reference) -> None:
+        """Writes `relmse` and `relmse_trimmed` against a reference into `stats`.
+
+        Raises:
+            ValueError: the images differ in size.
+        """
+        args = (self.image, reference.image, reference.variance)
+        self.stats["relmse"] = metrics.finite_or_none(metrics.relmse(*args))
+        self.stats["relmse_trimmed"] = metrics.finite_or_none(metrics.relmse_trimmed(*args))
+
+    def write(self, path: str | Path) -> None:
+        """Writes an EXR: the image as R, G, B and the variance as layer `variance`.
+
+        Raises:
+            OSError: it cannot be written; nothing is left behind.
+        """
+        _core.write_exr(str(path), {"": self.image, "variance": self.variance})
+
+
+def render(
+    scene: SceneLike,
+    guide: str | os.PathLike[str] | Guide | ForeignGuide = "realnvp",
+    spp: int | None = None,
+    time: float | None = None,
+    k: int = 2,
+    parametrisation: str = "bsdf",
+    uniform_fraction: float | None = None,
+    seed: int = 0,
+    threads: int | None = None,
+    progress: Progress = True,
+    *,
+    emitter_strategy: str | None = None,
+    sensor: Any = 0,
+    preset: str | None = None,
+    pilot_spp: int | None = None,
+    keep_pilot: bool | None = None,
+    replay: Replay | None = None,
+    **guide_options: Any,
+) -> Result:
+    """Renders the light that reaches the eye after exactly k reflections: pilot → fit → render.
+
+    Args:
+        scene: a path to a scene's XML file, a dictionary as for `mi.load_dict`, an `mi.Scene` in its current state,
+            or a `Scene`, which may be rendered many times. Where no Mitsuba variant is set, loading sets one.
+        guide: `none` for random numbers, a name of `pssflow.guide.registry()` (several joined by `+`), a fitted
+            `Guide` or the path of a saved one (no pilot is spent), or any object with fit, sample and log_prob.
+        spp: samples per pixel in all, pilot inside. Default: 16, or the preset's.
+        time: seconds in place of `spp`, for pilot, fit and rendering together; loading and the BVH come before. The
+            image then depends on the machine's speed; `replay` repeats it.
+        k: bounces, 1 … 32.
+        parametrisation: what a direction's numbers mean: `bsdf`, `cosine` or `uniform` (hemisphere).
+        uniform_fraction: share a of uniform paths in the mixture, in [0, 1]; no path's weight exceeds 1/a. Default:
+            the guide's, 0.25 for flows. At 0 the image may be biased.
+        seed: of all random numbers; one seed gives one image, bit for bit, on any number of threads.
+        threads: None for all cores.
+        progress: True for bars on stderr if that is a terminal, "always", False, or a function (phase, share done).
+        emitter_strategy: `mis` (default), `nee` (emitter samples alone, as the thesis), or `auto`.
+        sensor: index of the sensor, or a sensor object.
+        preset: `thesis`: NEE alone, a pilot of 16 spp that is discarded, a = 0, then 16 spp from the guide; with
+            another `spp`, half for the pilot. What is given beside it wins.
+        pilot_spp: samples per pixel of the pilot. Default: a quarter of `spp`, or a seventh of `time`.
+        keep_pilot: whether the pilot's paths enter the image. Default: yes.
+        replay: the record of an earlier run (`Result.stats` or the command's JSON file), whose guide, settings, seed
+            and passes are repeated, or only its `passes`.
+        **guide_options: the guide's own, as `epochs=7`; in a composite also `**{"realnvp.epochs": 7}`.
+
+    Returns:
+        The image, its variance, statistics, timings, and the guide, which can be saved or used again.
+
+    Raises:
+        UnsupportedError: the scene holds what cannot be rendered (a `ValueError`).
+        ValueError: an argument is wrong; one line that names it.
+        TypeError: `scene` or `guide` is of the wrong kind.
+        FileNotFoundError: there is no such file.
+        KeyboardInterrupt: on Ctrl-C, within a second.
+
+    Examples:
+        >>> result = pssflow.render("scenes/cornell-box/scene.xml", "realnvp", spp=64, k=2)  # doctest: +SKIP
+        >>> result.write("cornell-box.exr")  # doctest: +SKIP
+    """
+    settings: dict[str, Any] = {
+        "k": k,
+        "parametrisation": parametrisation,
+        "emitter_strategy": emitter_strategy,
+        "uniform_fraction": uniform_fraction,
+        "keep_pilot": keep_pilot,
+        "seed": seed,
+    }
+    if replay is not None:
+        if time is not None or spp is not None:
+            raise ValueError("`replay` repeats recorded passes; leave out `spp` and `time`")
+        if isinstance(replay, (str, os.PathLike, Mapping)):
+            guide, guide_options, replay = _replayed(read_replay(replay), guide, settings)
+    choice = choose(guide, guide_options)
+    plan = Plan.make(
+        learns=choice.learns,
+        spp=spp,
+        time=time,
+        pilot_spp=pilot_spp,
+        threads=threads,
+        preset=preset,
+        replay=replay,
+        **settings,
+    )
+    if not isinstance(scene, Scene):
+        scene = Scene(scene, sensor, threads=threads)
+    elif sensor != 0 and sensor is not scene.sensor and sensor != scene.sensor:
+        raise ValueError("`sensor` was given beside a `Scene`, which has its own; make another `Scene`")
+    return run(scene, choice, plan, progress)
+
+
+def run(scene: Scene, choice: Choice, plan: Plan, progress: Progress = True) -> Result:
+    """Renders with arguments that were checked already; see `render`."""
+    strategy, why = scene.resolve_strategy(plan.emitter_strategy)
+    hashes = (scene.core.columns_hash(plan.k, plan.parametrisation), scene.hash)
+    given = choice.given
+    if choice.path is not None:
+        given = Guide.load(choice.path, columns_hash=hashes[0], scene_hash=hashes[1])
+    with reporting(progress) as listener:
+        output = scene.core.render(
+            plan.core(choice.kind, choice.options, strategy),
+            given.core if isinstance(given, Guide) else given,
+            listener,
+        )
+    record: dict[str, Any] = json.loads(output["record"])
+    fitted = output["guide"]
+    used: Guide | ForeignGuide | None = None
+    if record["chosen"] != "none":
+        used = given
+        if used is None and fitted is not None:
+            used = Guide(fitted, columns_hash=hashes[0], scene_hash=hashes[1])
+    timings = {**scene.timings, **record["seconds"]}
+    notes = [*scene.notes, *([f"emitter_strategy auto: {strategy}, {why}"] if why else [])]
+    stats = {
+        "scene": scene.name,
+        "guide": choice.label,
+        **record,
+        "relmse": None,
+        "relmse_trimmed": None,
+        "notes": notes + record["notes"],
+        "seconds": {**timings, "total": sum(timings.values())},
+        "budget": plan.budget(learns=choice.learns),
+        "guide_options": choice.options,
+        "keep_pilot": plan.keep_pilot,
+        "version": _core.__version__,
+        "variant": scene.variant,
+    }
+    return Result(output["image"], output["variance"], stats, timings, used)
+
+
+def _replayed(
+    record: Mapping[str, Any], guide: Any, settings: dict[str, Any]
+) -> tuple[Any, dict[str, Any], list[dict[str, Any]]]:
+    """Guide, its options and passes of a record; its settings are written over `settings`.
+
+    A record knows a foreign object's class only, so that object must be given again.
+    """
+    names = ("k", "parametrisation", "emitter_strategy", "keep_pilot", "seed")
+    settings.update({name: record[name] for name in names}, uniform_fraction=record["a"])
+    if isinstance(guide, (str, os.PathLike)):
+        guide = record["guide"]
+    return guide, dict(record["guide_options"]), list(record["passes"])

@@ -1,0 +1,229 @@
+"""Paths per second of the tracer, beside its rays alone and beside Mitsuba's `path`: `make bench`.
+
+All contestants take turns within a round, so that a busy machine slows all of them; medians over the rounds are
+reported. Each is run once before, unmeasured: Mitsuba's LLVM variant compiles its kernel then.
+
+Rays per path. Ours are counted by the tracer. Mitsuba does not count: at depth k+1 its `path` sends up to k+1
+rays to find surfaces and up to k shadow rays, fewer where a path escapes. The shares of paths that reach x₁ … x_k are
+those of our own uniform paths, drawn from the same BSDFs; shadow rays are an upper bound, since none is sent to an emitter
+that faces away. A path of Mitsuba also gathers the light of fewer bounces, ours that of exactly k: rays per second
+are comparable, paths per second only with the rays beside them.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import click
+import drjit as dr
+import mitsuba as mi
+from rich.console import Console
+from rich.table import Table
+
+from ..cli import run_command
+from ..output import make_folder, write_json
+from ..scene import Scene
+from ..variants import llvm_problem
+
+SCENES = ("cornell-box", "teapot")
+SCALAR, LLVM = "scalar_rgb", "llvm_ad_rgb"
+
+
+@dataclass
+class Contestant:
+    """Something that traces `paths` paths when it is called."""
+
+    name: str
+    run: Callable[[], object]
+    paths: int
+    rays_per_path: float
+    counted: str
+    """Where `rays_per_path` comes from."""
+
+
+@click.command()
+@click.option("-o", "--output", default="out", show_default=True, help="Folder for bench.json.")
+@click.option("--scenes", "folder", default="scenes", show_default=True, help="Folder of scenes.")
+@click.option("--spp", default=16, show_default=True, type=click.IntRange(1), help="Samples a pixel.")
+@click.option("--rounds", default=5, show_default=True, type=click.IntRange(1))
+@click.option("--scale", default=1.0, show_default=True, help="Factor on the film's size.")
+@click.option("-k", "--bounces", "k", default=2, show_default=True, type=click.IntRange(1, 32))
+def bench(output: str, folder: str, spp: int, rounds: int, scale: float, k: int) -> None:
+    """Measures paths per second; writes bench.json."""
+    console = Console()
+    target = make_folder(output) / "bench.json"
+    before = os.getloadavg()
+    console.print(
+        f"{platform.machine()}, {os.cpu_count()} cores, load average {before[0]:.2f} "
+        f"(1 min) before the start; {spp} spp, k = {k}, medians of {rounds} interleaved rounds, "
+        "warm-up and compilation not measured"
+    )
+    problem = llvm_problem()
+    if problem:
+        console.print(f"without {LLVM}: {problem}")
+    rows = []
+    for name in SCENES:
+        contests = {
+            threads: contestants(Path(folder) / name / "scene.xml", spp, k, threads, scale)
+            for threads in (1, 2)
+        }
+        measured = measure(contests, rounds)
+        rows += [row | {"scene": name} for row in measured]
+        console.print(table(name, measured))
+    after = os.getloadavg()
+    console.print(f"load average {after[0]:.2f} (1 min) at the end")
+    console.print(
+        f"“rays” are sent to Embree per path; for Mitsuba an upper bound (shadow rays towards emitters that face "
+        f"away are not sent). Mitsuba's path of depth {k + 1} gathers the light of up to {k} bounces, "
+        f"ours that of exactly {k}: compare µs per ray.",
+        style="dim",
+        highlight=False,
+    )
+    write_json(
+        target,
+        {
+            "machine": platform.machine(),
+            "cores": os.cpu_count(),
+            "load_average": {"before": before, "after": after},
+            "spp": spp,
+            "k": k,
+            "rounds": rounds,
+            "rows": rows,
+        },
+    )
+    console.print(f"wrote {target}")
+
+
+def contestants(path: Path, spp: int, k: int, threads: int, scale: float) -> list[Contestant]:
+    """All that take turns on one scene."""
+    mi.set_variant(SCALAR)
+    scene = Scene(path, scale=scale, threads=threads)
+    paths = scene.width * scene.height * spp
+    alone = scene.core.rays_alone(spp=1, k=k, threads=threads)
+    reach = [_reached(scene, bounces) for bounces in range(1, k + 1)]
+    found = [
+        Contestant(
+            f"pssflow, {strategy}",
+            lambda strategy=strategy: scene.render(
+                "none",
+                spp,
+                k=k,
+                emitter_strategy=strategy,
+                threads=threads,
+                progress=False,
+            ),
+            paths,
+            # `rays_alone` sends those of NEE; MIS adds the ray from x_k that looks for an emitter.
+            alone["rays_per_path"] + (reach[-1] if strategy == "mis" else 0.0),
+            "counted",
+        )
+        for strategy in ("mis", "nee")
+    ]
+    found.append(
+        Contestant(
+            "its rays alone",
+            lambda: scene.core.rays_alone(spp=spp, k=k, threads=threads),
+            paths,
+            alone["rays_per_path"],
+            "counted",
+        )
+    )
+    bound = 1 + 2 * sum(reach)
+    for variant in (SCALAR, *(() if llvm_problem() else (LLVM,))):
+        run = _mitsuba(variant, path, spp, k, threads, scale)
+        found.append(Contestant(f"Mitsuba {variant}", run, paths, bound, "upper bound"))
+    return found
+
+
+def measure(contests: dict[int, list[Contestant]], rounds: int) -> list[dict[str, Any]]:
+    """Runs all in turn; one row for each contestant and number of threads."""
+    seconds: dict[tuple[int, str], list[float]] = {}
+    for measured in range(-1, rounds):
+        for threads, group in contests.items():
+            for contestant in group:
+                start = time.perf_counter()
+                result = contestant.run()
+                elapsed = time.perf_counter() - start
+                if isinstance(result, dict):  # rays_alone times its queries itself
+                    elapsed = result["seconds"]
+                if measured >= 0:
+                    seconds.setdefault((threads, contestant.name), []).append(elapsed)
+    rows = []
+    for threads, group in contests.items():
+        for contestant in group:
+            times = seconds[threads, contestant.name]
+            median = statistics.median(times)
+            rows.append(
+                {
+                    "contestant": contestant.name,
+                    "threads": threads,
+                    "paths_per_second": contestant.paths / median,
+                    "us_per_path": 1e6 * median / contestant.paths,
+                    "rays_per_path": contestant.rays_per_path,
+                    "rays": contestant.counted,
+                    "mrays_per_second": contestant.rays_per_path * contestant.paths / median / 1e6,
+                    "seconds": times,
+                }
+            )
+    return rows
+
+
+def table(name: str, rows: list[dict[str, Any]]) -> Table:
+    """One scene's rows."""
+    shown = Table(title=f"scenes/{name}", title_justify="left")
+    shown.add_column("")
+    for heading in ("threads", "Mpaths/s", "µs/path", "rays/path", "µs/ray", "spread"):
+        shown.add_column(heading, justify="right")
+    for i, row in enumerate(rows):
+        times = row["seconds"]
+        spread = (max(times) - min(times)) / statistics.median(times)
+        bound = "≤ " if row["rays"] != "counted" else ""
+        shown.add_row(
+            row["contestant"],
+            str(row["threads"]),
+            f"{row['paths_per_second'] / 1e6:.2f}",
+            f"{row['us_per_path']:.3f}",
+            f"{bound}{row['rays_per_path']:.2f}",
+            f"{1 / row['mrays_per_second']:.3f}",
+            f"±{50 * spread:.0f} %",
+            end_section=i + 1 < len(rows) and rows[i + 1]["threads"] != row["threads"],
+        )
+    return shown
+
+
+def _reached(scene: Scene, bounces: int) -> float:
+    """Share of uniform paths that have the vertices x₁ … x_bounces."""
+    stats = scene.render(
+        "none", 4, k=bounces, emitter_strategy="nee", seed=1, progress=False
+    ).stats
+    return stats["paths_found"] / stats["camera_rays"]
+
+
+def _mitsuba(
+    variant: str, path: Path, spp: int, k: int, threads: int, scale: float
+) -> Callable[[], object]:
+    """Mitsuba's `path` on the same film; the variant and the size of its thread pool are set before each run."""
+    mi.set_variant(variant)
+    scene = Scene(path, scale=scale).mi_scene
+    integrator = mi.load_dict({"type": "path", "max_depth": k + 1, "rr_depth": k + 2})
+
+    def run() -> None:
+        mi.set_variant(variant)
+        dr.set_thread_count(threads)
+        image = integrator.render(scene, seed=0, spp=spp)
+        dr.eval(image)
+        dr.sync_thread()
+
+    return run
+
+
+if __name__ == "__main__":
+    sys.exit(run_command(bench))

@@ -1,0 +1,221 @@
+//! Pilot paths as training data.
+
+use pss_rng::{Purpose, Stream};
+
+use crate::GuideError;
+
+/// Paths to learn from, one row each.
+///
+/// | field   | shape     | meaning                                                          |
+/// |---------|-----------|------------------------------------------------------------------|
+/// | `u`     | `(n, d)`  | primary numbers, row-major                                       |
+/// | `f`     | `n`       | luminance of the undivided contribution                          |
+/// | `f_max` | `n`       | its largest RGB component                                        |
+/// | `g`     | `n`       | density that `u` was drawn from, 1 for uniform                   |
+/// | `pixel` | `n` or 0  | film position in [0, 1)²                                         |
+///
+/// Only non-zero paths need be given: zeros carry no gradient and are counted in `zeros`.
+#[derive(Clone, Copy, Debug)]
+pub struct Records<'a> {
+    /// Numbers per path.
+    pub dims: usize,
+    /// Primary numbers, `n · dims`.
+    pub u: &'a [f32],
+    /// Luminances, `n`.
+    pub f: &'a [f32],
+    /// Largest RGB components, `n`.
+    pub f_max: &'a [f32],
+    /// Densities of the draw, `n`.
+    pub g: &'a [f32],
+    /// Film positions, `n` (or none).
+    pub pixel: &'a [[f32; 2]],
+    /// Paths without light, not given.
+    pub zeros: u64,
+}
+
+/// Rows that survive cleaning.
+#[derive(Debug)]
+pub(crate) struct Usable {
+    /// Indices of the rows.
+    pub(crate) rows: Vec<usize>,
+    /// Resampling weight f_max/g of each.
+    pub(crate) weights: Vec<f64>,
+    /// Rows that were not finite.
+    pub(crate) nonfinite: usize,
+    /// Rows above the quantile.
+    pub(crate) outliers: usize,
+}
+
+impl Records<'_> {
+    /// Drops zeros, what is not finite, and what is brighter than the quantile `keep` of the rest.
+    pub(crate) fn usable(&self, keep: f64) -> Result<Usable, GuideError> {
+        let rows = self.f_max.len();
+        let shape = |array, found, expected| {
+            if found == expected {
+                return Ok(());
+            }
+            Err(GuideError::Shape {
+                array,
+                found,
+                expected,
+                rows,
+                dims: self.dims,
+            })
+        };
+        shape("u", self.u.len(), rows.saturating_mul(self.dims))?;
+        shape("f", self.f.len(), rows)?;
+        shape("g", self.g.len(), rows)?;
+        if !self.pixel.is_empty() {
+            shape("pixel", self.pixel.len(), rows)?;
+        }
+
+        let finite = |r: usize| {
+            self.f[r].is_finite()
+                && self.f_max[r].is_finite()
+                && self.g[r].is_finite()
+                && self.g[r] > 0.0
+                && self.u[r * self.dims..(r + 1) * self.dims]
+                    .iter()
+                    .all(|u| (0.0..1.0).contains(u))
+        };
+        let (mut kept, mut nonfinite) = (Vec::with_capacity(rows), 0);
+        for r in 0..rows {
+            if !finite(r) {
+                nonfinite += 1;
+            } else if self.f_max[r] > 0.0 {
+                kept.push(r);
+            }
+        }
+
+        let before = kept.len();
+        if let Some(limit) = quantile(kept.iter().map(|&r| self.f_max[r]), keep) {
+            kept.retain(|&r| self.f_max[r] <= limit);
+        }
+        if kept.len() < 2 {
+            return Err(GuideError::TooFewPaths {
+                usable: kept.len(),
+                given: rows,
+                nonfinite,
+                zeros: self.zeros,
+            });
+        }
+        let weights = kept
+            .iter()
+            .map(|&r| f64::from(self.f_max[r]) / f64::from(self.g[r]))
+            .collect();
+        Ok(Usable {
+            outliers: before - kept.len(),
+            rows: kept,
+            weights,
+            nonfinite,
+        })
+    }
+}
+
+impl Usable {
+    /// `n` rows drawn with replacement in proportion to their weights.
+    pub(crate) fn resample(&self, n: usize, seed: u64) -> Vec<usize> {
+        let mut sum = 0.0;
+        let cumulative: Vec<f64> = self
+            .weights
+            .iter()
+            .map(|w| {
+                sum += w;
+                sum
+            })
+            .collect();
+        let mut numbers = Stream::new(seed, Purpose::Training).sequence(0, 0);
+        (0..n)
+            .map(|_| {
+                let x = numbers.next_f64() * sum;
+                let at = cumulative.partition_point(|&c| c <= x);
+                self.rows[at.min(self.rows.len() - 1)]
+            })
+            .collect()
+    }
+}
+
+/// The value that a share `p` of all values does not exceed.
+fn quantile(values: impl Iterator<Item = f32>, p: f64) -> Option<f32> {
+    let mut values: Vec<f32> = values.collect();
+    if values.is_empty() {
+        return None;
+    }
+    let at = ((p * values.len() as f64).ceil() as usize).clamp(1, values.len()) - 1;
+    Some(*values.select_nth_unstable_by(at, f32::total_cmp).1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn records<'a>(u: &'a [f32], f: &'a [f32], g: &'a [f32]) -> Records<'a> {
+        Records {
+            dims: 1,
+            u,
+            f,
+            f_max: f,
+            g,
+            pixel: &[],
+            zeros: 3,
+        }
+    }
+
+    #[test]
+    fn rows_that_are_not_finite_are_dropped_and_counted() {
+        let u = [0.1, 0.2, 0.3, 1.0, 0.5, 0.6, 0.7];
+        let f = [1.0, f32::NAN, 2.0, 1.0, f32::INFINITY, 0.0, 1.0];
+        let g = [1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0];
+        let usable = records(&u, &f, &g).usable(1.0).unwrap();
+        assert_eq!(usable.rows, [0, 2]);
+        assert_eq!(usable.nonfinite, 4);
+    }
+
+    #[test]
+    fn outliers_are_the_brightest_rows() {
+        let u = vec![0.5; 1000];
+        let f: Vec<f32> = (1..=1000).map(|i| i as f32).collect();
+        let g = vec![1.0; 1000];
+        let usable = records(&u, &f, &g).usable(0.999).unwrap();
+        assert_eq!(usable.outliers, 1);
+        assert_eq!(usable.rows.last(), Some(&998));
+    }
+
+    #[test]
+    fn one_path_is_too_few_and_the_error_says_what_to_do() {
+        let error = records(&[0.5], &[1.0], &[1.0]).usable(1.0).unwrap_err();
+        assert_eq!(
+            error.to_string(),
+            "1 usable non-zero paths among 1 given (0 not finite, 3 zeros): a guide needs at least 2. \
+             Give the pilot more samples, or render with guide `none`"
+        );
+    }
+
+    #[test]
+    fn arrays_of_different_length_are_refused() {
+        let error = records(&[0.5, 0.6], &[1.0, 1.0], &[1.0])
+            .usable(1.0)
+            .unwrap_err();
+        assert_eq!(
+            error.to_string(),
+            "records: `g` holds 1 values, but 2 belong to 2 paths of 1 numbers"
+        );
+    }
+
+    #[test]
+    fn resampling_is_in_proportion_to_the_weights() {
+        let u = [0.1, 0.2, 0.3];
+        let f = [1.0, 2.0, 3.0];
+        let g = [1.0, 1.0, 0.5];
+        let rows = records(&u, &f, &g).usable(1.0).unwrap().resample(90_000, 4);
+        // Weights 1 : 2 : 6; binomial counts within five standard errors.
+        for (row, share) in [1.0 / 9.0, 2.0 / 9.0, 6.0 / 9.0].into_iter().enumerate() {
+            let count = rows.iter().filter(|&&r| r == row).count() as f64;
+            let se = (90_000.0 * share * (1.0 - share)).sqrt();
+            assert!(
+                (count - 90_000.0 * share).abs() < 5.0 * se,
+                "row {row}: {count}"
+            );
+        }
+    }
+}

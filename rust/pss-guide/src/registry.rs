@@ -1,0 +1,113 @@
+//! The guides that can be fitted: adding one is a file and a line here; the tests then cover it.
+
+use serde_json::{Map, Value};
+
+use crate::file::Contents;
+use crate::flow::{Domain, RealNvp, options::RealNvpOptions};
+use crate::{Decision, Fit, Guide, GuideError, Records, options};
+
+/// Signature of [`GuideSpec::fit`]: options, data, seed, progress.
+pub type FitFn = fn(
+    &Map<String, Value>,
+    &Records<'_>,
+    u64,
+    &mut dyn FnMut(f32) -> bool,
+) -> Result<Fit, GuideError>;
+
+/// One line of the registry.
+#[derive(Debug)]
+pub struct GuideSpec {
+    /// Name that users type.
+    pub name: &'static str,
+    /// One line for help texts.
+    pub summary: &'static str,
+    /// What the guide models.
+    pub models: &'static [Decision],
+    /// All options with their defaults.
+    pub defaults: fn() -> Map<String, Value>,
+    /// Checks options without fitting.
+    pub validate: fn(&Map<String, Value>) -> Result<(), GuideError>,
+    /// Fits; see [`fit`].
+    pub fit: FitFn,
+    /// Rebuilds the guide from a file, or says what does not fit together.
+    pub(crate) restore: fn(Contents) -> Result<Box<dyn Guide>, String>,
+}
+
+static REGISTRY: [GuideSpec; 2] = [
+    GuideSpec {
+        name: "realnvp",
+        summary: "the thesis: RealNVP over all numbers at once, normal prior, samples outside the cube are lost",
+        models: &[Decision::Path],
+        defaults: || options::to_map(&RealNvpOptions::defaults(Domain::Cube)),
+        validate: |o| RealNvpOptions::parse(Domain::Cube, o).map(drop),
+        fit: |o, r, s, p| RealNvp::fit(Domain::Cube, o, r, s, p),
+        restore: |c| RealNvp::restore(Domain::Cube, c),
+    },
+    GuideSpec {
+        name: "realnvp-logit",
+        summary: "the same through a logit, so that every sample lands in the cube",
+        models: &[Decision::Path],
+        defaults: || options::to_map(&RealNvpOptions::defaults(Domain::Logit)),
+        validate: |o| RealNvpOptions::parse(Domain::Logit, o).map(drop),
+        fit: |o, r, s, p| RealNvp::fit(Domain::Logit, o, r, s, p),
+        restore: |c| RealNvp::restore(Domain::Logit, c),
+    },
+];
+
+/// All guides that can be fitted. `none`, the uniform density, needs no fit and is the caller's.
+pub fn registry() -> &'static [GuideSpec] {
+    &REGISTRY
+}
+
+/// The registry line of `name`.
+///
+/// # Errors
+/// [`GuideError::UnknownGuide`], which lists the known names.
+pub fn find(name: &str) -> Result<&'static GuideSpec, GuideError> {
+    REGISTRY
+        .iter()
+        .find(|spec| spec.name == name)
+        .ok_or_else(|| GuideError::UnknownGuide {
+            name: name.to_owned(),
+            known: REGISTRY
+                .iter()
+                .map(|spec| spec.name)
+                .collect::<Vec<_>>()
+                .join(", "),
+        })
+}
+
+/// Fits the guide `name` to `records`.
+///
+/// `options` are written over the guide's defaults. `progress` is called with the share done, a few
+/// times per second at least, and cancels by returning false. The result depends on the arguments
+/// alone, bit for bit, and not on the number of threads.
+///
+/// # Errors
+/// [`GuideError::UnknownGuide`], [`GuideError::UnknownOption`], [`GuideError::Option`],
+/// [`GuideError::Shape`], [`GuideError::TooFewPaths`] with fewer than two usable paths,
+/// [`GuideError::Diverged`] when the loss is no longer finite, [`GuideError::Cancelled`].
+///
+/// # Examples
+/// ```
+/// use pss_guide::{Decision, Records, fit};
+/// // Light arrives only where u₀ < ½.
+/// let u: Vec<f32> = (0..4000).flat_map(|i| [(i % 63) as f32 / 126.0, (i % 64) as f32 / 64.0]).collect();
+/// let one = vec![1.0; 4000];
+/// let records = Records { dims: 2, u: &u, f: &one, f_max: &one, g: &one, pixel: &[], zeros: 4000 };
+/// let options = serde_json::json!({ "hidden": 16, "layers": 2 });
+/// let fit = fit("realnvp-logit", options.as_object().unwrap(), &records, 1, &mut |_| true)?;
+/// let mut q = [0.0; 2];
+/// fit.guide.density(Decision::Path, &[], &[0.25, 0.5, 0.75, 0.5], &mut q);
+/// assert!(q[0] > 1.0 && q[1] < 1.0);
+/// # Ok::<(), pss_guide::GuideError>(())
+/// ```
+pub fn fit(
+    name: &str,
+    options: &Map<String, Value>,
+    records: &Records<'_>,
+    seed: u64,
+    progress: &mut dyn FnMut(f32) -> bool,
+) -> Result<Fit, GuideError> {
+    (find(name)?.fit)(options, records, seed, progress)
+}

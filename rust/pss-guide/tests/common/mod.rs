@@ -1,0 +1,251 @@
+//! Data, fits and statistics that the tests share.
+#![allow(clippy::unwrap_used)]
+
+use pss_guide::{Decision, Fit, Guide, Header, Records, fit};
+use pss_rng::{Purpose, Stream};
+use serde_json::{Map, Value};
+
+/// What the tests' files claim to be fitted for.
+#[allow(non_snake_case, reason = "stands for a constant")]
+pub fn HEADER() -> Header {
+    Header {
+        columns_hash: "columns-1".to_owned(),
+        scene_hash: "scene-1".to_owned(),
+    }
+}
+
+pub fn options(list: &[(&str, Value)]) -> Map<String, Value> {
+    list.iter()
+        .map(|(name, value)| ((*name).to_owned(), value.clone()))
+        .collect()
+}
+
+/// `n` rows of uniform numbers.
+pub fn uniform(n: usize, dims: usize, stream: u32) -> Vec<f32> {
+    let mut numbers = Stream::new(21, Purpose::Test).sequence(stream, dims as u32);
+    (0..n * dims).map(|_| numbers.next_f32()).collect()
+}
+
+/// Records of two paths, for tests that never get to look at them.
+pub fn indent() -> Records<'static> {
+    Records {
+        dims: 1,
+        u: &[0.25, 0.75],
+        f: &[1.0; 2],
+        f_max: &[1.0; 2],
+        g: &[1.0; 2],
+        pixel: &[],
+        zeros: 0,
+    }
+}
+
+/// A contribution with a known integral: Π over the columns of 30 u² (1 − u)² where the first column is
+/// below 3/4, and 0 beyond, as if something stood in the way there.
+#[derive(Clone, Copy)]
+pub struct Target {
+    pub dims: usize,
+}
+
+impl Target {
+    pub fn f(&self, u: &[f32]) -> f32 {
+        if u[0] >= 0.75 {
+            return 0.0;
+        }
+        u.iter()
+            .map(|u| 30.0 * u * u * (1.0 - u) * (1.0 - u))
+            .product()
+    }
+
+    /// Each column's integral is 1; the first one's ends at x = 3/4: 10x³ − 15x⁴ + 6x⁵.
+    pub fn integral(&self) -> f64 {
+        let x = 0.75f64;
+        10.0 * x.powi(3) - 15.0 * x.powi(4) + 6.0 * x.powi(5)
+    }
+
+    /// Uniform paths and their contributions, zeros among them.
+    pub fn paths(&self, n: usize, stream: u32) -> (Vec<f32>, Vec<f32>) {
+        let u = uniform(n, self.dims, 100 + stream);
+        let f = u.chunks_exact(self.dims).map(|u| self.f(u)).collect();
+        (u, f)
+    }
+}
+
+/// A guide fitted to `n` uniform paths of [`Target`].
+pub fn fit_with(name: &str, dims: usize, n: usize, options: Map<String, Value>, seed: u64) -> Fit {
+    let (u, f) = Target { dims }.paths(n, 0);
+    let g = vec![1.0; n];
+    let records = Records {
+        dims,
+        u: &u,
+        f: &f,
+        f_max: &f,
+        g: &g,
+        pixel: &[],
+        zeros: 0,
+    };
+    fit(name, &options, &records, seed, &mut |_| true).unwrap()
+}
+
+/// The default fit of the tests.
+pub fn fit_small(name: &str, dims: usize) -> Fit {
+    fit_with(name, dims, 6000, Map::new(), 1)
+}
+
+/// Mean and its standard error.
+pub fn mean(values: impl Iterator<Item = f64>) -> (f64, f64) {
+    let (mut n, mut mean, mut square) = (0.0, 0.0, 0.0);
+    for x in values {
+        n += 1.0;
+        let delta = x - mean;
+        mean += delta / n;
+        square += delta * (x - mean);
+    }
+    (mean, (square / (n - 1.0) / n).sqrt())
+}
+
+/// p-value of Pearson's χ² over 16 × 16 cells and the outside, 200,000 samples against the integrated
+/// density; a share `wrong` of the samples is replaced by uniform numbers.
+pub fn chi_square(guide: &dyn Guide, wrong: f64) -> f64 {
+    const CELLS: usize = 16;
+    const INNER: usize = 8;
+    let n = 200_000;
+    let base = uniform(n, 2, 7);
+    let (mut u, mut q) = (base.clone(), vec![0.0; n]);
+    guide.sample(Decision::Path, &[], &mut u, &mut q);
+    let replaced = (wrong * n as f64) as usize * 2;
+    u[..replaced].copy_from_slice(&base[..replaced]);
+    let mut counts = vec![0.0; CELLS * CELLS + 1];
+    for u in u.chunks_exact(2) {
+        let inside = u.iter().all(|u| (0.0..1.0).contains(u));
+        let cell = |u: f32| (u * CELLS as f32) as usize;
+        counts[if inside {
+            cell(u[1]) * CELLS + cell(u[0])
+        } else {
+            CELLS * CELLS
+        }] += 1.0;
+    }
+
+    let side = CELLS * INNER;
+    let middle = |i: usize| (i as f32 + 0.5) / side as f32;
+    let grid: Vec<f32> = (0..side * side)
+        .flat_map(|i| [middle(i % side), middle(i / side)])
+        .collect();
+    let mut density = vec![0.0; side * side];
+    guide.density(Decision::Path, &[], &grid, &mut density);
+    let mut expected = vec![0.0; CELLS * CELLS + 1];
+    for (i, q) in density.iter().enumerate() {
+        expected[i / side / INNER * CELLS + i % side / INNER] +=
+            n as f64 * f64::from(*q) / (side * side) as f64;
+    }
+    expected[CELLS * CELLS] = (n as f64 - expected.iter().sum::<f64>()).max(0.0);
+
+    // Cells that expect less than five samples are pooled.
+    let (mut statistic, mut degrees, mut pool) = (0.0, -1.0, (0.0, 0.0));
+    let mut add = |count: f64, expected: f64| {
+        statistic += (count - expected).powi(2) / expected;
+        degrees += 1.0;
+    };
+    for (&count, &expected) in counts.iter().zip(&expected) {
+        if expected < 5.0 {
+            pool = (pool.0 + count, pool.1 + expected);
+        } else {
+            add(count, expected);
+        }
+    }
+    if pool.1 >= 5.0 {
+        add(pool.0, pool.1);
+    }
+    chi_square_tail(statistic, degrees)
+}
+
+/// P(χ² > x) after Wilson and Hilferty (1931): good to a few per cent where it is used here.
+fn chi_square_tail(x: f64, degrees: f64) -> f64 {
+    let v = 2.0 / (9.0 * degrees);
+    let z = ((x / degrees).cbrt() - (1.0 - v)) / v.sqrt();
+    // Upper tail of the normal by its continued fraction for z > 0, and by symmetry below.
+    let tail = |z: f64| {
+        let fraction = (1..=200).rev().fold(z, |f, k| z + f64::from(k) / f);
+        (-0.5 * z * z).exp() / (fraction * std::f64::consts::TAU.sqrt())
+    };
+    if z.abs() < 0.5 {
+        return 0.5 - z * 0.398_942;
+    }
+    if z > 0.0 { tail(z) } else { 1.0 - tail(-z) }
+}
+
+/// Two interleaved half circles of radius 1 with normal noise of 0.1, scaled into the cube.
+pub mod moons {
+    use pss_rng::{Purpose, Stream};
+
+    const NOISE: f64 = 0.1;
+    /// Extent of the square that becomes the cube.
+    const SIZE: [f64; 2] = [4.0, 3.0];
+    const CORNER: [f64; 2] = [-1.5, -1.25];
+
+    fn centre(moon: bool, angle: f64) -> [f64; 2] {
+        let (sin, cos) = angle.sin_cos();
+        if moon {
+            [cos, sin]
+        } else {
+            [1.0 - cos, 0.5 - sin]
+        }
+    }
+
+    /// `n` points.
+    pub fn points(n: usize, stream: u32) -> Vec<f32> {
+        let mut numbers = Stream::new(31, Purpose::Test).sequence(stream, 0);
+        let mut points = Vec::with_capacity(2 * n);
+        while points.len() < 2 * n {
+            let c = centre(
+                numbers.next_f64() < 0.5,
+                std::f64::consts::PI * numbers.next_f64(),
+            );
+            let p: [f32; 2] = std::array::from_fn(|i| {
+                ((c[i] + NOISE * numbers.next_normal() - CORNER[i]) / SIZE[i]) as f32
+            });
+            // Both moons keep at least 4 standard deviations from every side.
+            if p.iter().all(|u| (0.0..1.0).contains(u)) {
+                points.extend(p);
+            }
+        }
+        points
+    }
+
+    /// Mean ln of the true density, by quadrature along the arcs.
+    pub fn mean_log_density(points: &[f32]) -> f64 {
+        const STEPS: usize = 400;
+        let centres: Vec<[f64; 2]> = [true, false]
+            .into_iter()
+            .flat_map(|moon| {
+                (0..STEPS).map(move |i| {
+                    centre(moon, std::f64::consts::PI * (i as f64 + 0.5) / STEPS as f64)
+                })
+            })
+            .collect();
+        let scale =
+            SIZE[0] * SIZE[1] / (centres.len() as f64 * std::f64::consts::TAU * NOISE * NOISE);
+        mean(points, |u| {
+            let x: [f64; 2] = std::array::from_fn(|i| CORNER[i] + SIZE[i] * f64::from(u[i]));
+            let bump = |c: &[f64; 2]| {
+                (-((x[0] - c[0]).powi(2) + (x[1] - c[1]).powi(2)) / (2.0 * NOISE * NOISE)).exp()
+            };
+            (scale * centres.iter().map(bump).sum::<f64>()).ln()
+        })
+    }
+
+    /// Mean ln density of the normal with the points' own moments.
+    pub fn normal_log_density(points: &[f32]) -> f64 {
+        let m = [0, 1].map(|i| mean(points, |u| f64::from(u[i])));
+        let c = |i: usize, j: usize| {
+            mean(points, |u| {
+                (f64::from(u[i]) - m[i]) * (f64::from(u[j]) - m[j])
+            })
+        };
+        let determinant = c(0, 0) * c(1, 1) - c(0, 1) * c(0, 1);
+        -0.5 * determinant.ln() - std::f64::consts::TAU.ln() - 1.0
+    }
+
+    fn mean(points: &[f32], f: impl Fn(&[f32]) -> f64) -> f64 {
+        points.chunks_exact(2).map(f).sum::<f64>() / (points.len() / 2) as f64
+    }
+}

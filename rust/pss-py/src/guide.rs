@@ -1,0 +1,210 @@
+//! `Guide`: a fitted density in Python.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use numpy::{PyReadonlyArray1, PyReadonlyArray2};
+use pss_guide::{Decision, Header, Records};
+use pss_rng::{Purpose, Stream};
+use pyo3::prelude::*;
+use serde_json::{Map, Value};
+
+use crate::watch::watched;
+use crate::{arrays, errors};
+
+/// A fitted density on the cube of primary numbers.
+#[pyclass(module = "pssflow._core", frozen)]
+#[derive(Debug)]
+pub(crate) struct Guide {
+    pub(crate) inner: Arc<dyn pss_guide::Guide>,
+}
+
+/// Rows that are drawn or evaluated before Python is asked for signals again.
+const CHUNK: usize = 1 << 14;
+
+#[pymethods]
+impl Guide {
+    /// Fits guide `name` to numbers and contributions.
+    #[staticmethod]
+    #[pyo3(signature = (name, u, f, *, f_max=None, g=None, zeros=0, options="{}", seed=0, progress=None))]
+    #[allow(clippy::too_many_arguments)]
+    fn fit(
+        py: Python<'_>,
+        name: &str,
+        u: PyReadonlyArray2<'_, f32>,
+        f: PyReadonlyArray1<'_, f32>,
+        f_max: Option<PyReadonlyArray1<'_, f32>>,
+        g: Option<PyReadonlyArray1<'_, f32>>,
+        zeros: u64,
+        options: &str,
+        seed: u64,
+        progress: Option<Py<PyAny>>,
+    ) -> PyResult<Self> {
+        let options = parse_options(options)?;
+        let (u, dims) = arrays::matrix(&u);
+        let f = arrays::vector(&f);
+        let f_max = f_max.map_or_else(|| f.clone(), |a| arrays::vector(&a));
+        let g = g.map_or_else(|| vec![1.0; f.len()], |a| arrays::vector(&a));
+        let fit = watched(py, progress.as_ref(), |shared| {
+            let records = Records {
+                dims,
+                u: &u,
+                f: &f,
+                f_max: &f_max,
+                g: &g,
+                pixel: &[],
+                zeros,
+            };
+            use pssflow::Progress;
+            pss_guide::fit(name, &options, &records, seed, &mut |done| {
+                shared.update(pssflow::Phase::Fit, done);
+                !shared.cancelled()
+            })
+        })?
+        .map_err(errors::guide)?;
+        Ok(Self {
+            inner: Arc::from(fit.guide),
+        })
+    }
+
+    /// Reads a guide; with both hashes it is refused for another scene or other columns.
+    #[staticmethod]
+    #[pyo3(signature = (path, columns_hash=None, scene_hash=None))]
+    fn load(
+        path: PathBuf,
+        columns_hash: Option<String>,
+        scene_hash: Option<String>,
+    ) -> PyResult<Self> {
+        let guide = match (columns_hash, scene_hash) {
+            (Some(columns_hash), Some(scene_hash)) => pss_guide::load(
+                &path,
+                &Header {
+                    columns_hash,
+                    scene_hash,
+                },
+            ),
+            _ => pss_guide::load_unchecked(&path).map(|(guide, _)| guide),
+        };
+        Ok(Self {
+            inner: Arc::from(guide.map_err(errors::guide)?),
+        })
+    }
+
+    /// Writes the guide with the hashes of the columns and the scene that it is for.
+    fn save(&self, path: PathBuf, columns_hash: String, scene_hash: String) -> PyResult<()> {
+        self.inner
+            .save(
+                &path,
+                &Header {
+                    columns_hash,
+                    scene_hash,
+                },
+            )
+            .map_err(errors::guide)
+    }
+
+    /// Draws rows of numbers, and their log-density.
+    #[pyo3(signature = (n, seed=0))]
+    fn sample(&self, py: Python<'_>, n: usize, seed: u64) -> PyResult<(Py<PyAny>, Py<PyAny>)> {
+        let dims = self.inner.dims();
+        let stream = Stream::new(seed, Purpose::Guide);
+        let (mut u, mut log_q) = (Vec::with_capacity(n * dims), Vec::with_capacity(n));
+        for start in (0..n).step_by(CHUNK) {
+            py.check_signals()?;
+            let rows = (n - start).min(CHUNK);
+            let (chunk, q) = py.detach(|| {
+                let mut chunk = Vec::with_capacity(rows * dims);
+                for row in start..start + rows {
+                    let mut numbers = stream.sequence(row as u32, (row as u64 >> 32) as u32);
+                    chunk.extend((0..dims).map(|_| numbers.next_f32()));
+                }
+                let mut q = vec![0.0; rows];
+                self.inner.sample(Decision::Path, &[], &mut chunk, &mut q);
+                (chunk, q)
+            });
+            u.extend(chunk);
+            log_q.extend(q.into_iter().map(f32::ln));
+        }
+        Ok((
+            arrays::to_matrix(py, u, dims)?,
+            arrays::to_vector(py, log_q),
+        ))
+    }
+
+    /// Log-density of rows.
+    fn log_prob(&self, py: Python<'_>, u: PyReadonlyArray2<'_, f32>) -> PyResult<Py<PyAny>> {
+        let (u, width) = arrays::matrix(&u);
+        let dims = self.inner.dims();
+        if width != dims {
+            return Err(errors::value(format!(
+                "u has {width} columns, but this guide has {dims}"
+            )));
+        }
+        let mut log_q = Vec::with_capacity(u.len() / dims);
+        for chunk in u.chunks(CHUNK * dims) {
+            py.check_signals()?;
+            let mut q = vec![0.0; chunk.len() / dims];
+            py.detach(|| self.inner.density(Decision::Path, &[], chunk, &mut q));
+            log_q.extend(q.into_iter().map(f32::ln));
+        }
+        Ok(arrays::to_vector(py, log_q))
+    }
+
+    /// Name in the registry.
+    #[getter]
+    fn name(&self) -> &str {
+        self.inner.name()
+    }
+
+    /// Numbers a row.
+    #[getter]
+    fn dims(&self) -> usize {
+        self.inner.dims()
+    }
+
+    /// Trained parameters.
+    #[getter]
+    fn parameters(&self) -> usize {
+        self.inner.parameters()
+    }
+
+    /// Estimated share of samples outside the cube.
+    #[getter]
+    fn mass_outside(&self) -> f64 {
+        self.inner.mass_outside()
+    }
+
+    /// Configuration and facts, JSON.
+    fn describe(&self) -> String {
+        self.inner.describe().to_string()
+    }
+
+    fn __repr__(&self) -> String {
+        format!("Guide({:?}, dims={})", self.inner.name(), self.inner.dims())
+    }
+}
+
+/// JSON options of a guide.
+pub(crate) fn parse_options(options: &str) -> PyResult<Map<String, Value>> {
+    serde_json::from_str(options).map_err(|e| {
+        errors::value(format!(
+            "guide options {options:?}: {e}; expected a JSON object"
+        ))
+    })
+}
+
+/// The registry, JSON.
+#[pyfunction]
+pub(crate) fn guides() -> String {
+    let list: Vec<Value> = pss_guide::registry()
+        .iter()
+        .map(|g| {
+            serde_json::json!({
+                "name": g.name,
+                "summary": g.summary,
+                "options": (g.defaults)(),
+            })
+        })
+        .collect();
+    Value::from(list).to_string()
+}

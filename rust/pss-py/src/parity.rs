@@ -1,0 +1,216 @@
+//! Values of single plugins, for tests against one Mitsuba call.
+
+use numpy::PyReadonlyArray2;
+use pss_render::bsdf::ShadingPoint;
+use pss_render::math::{Rgb, Vec3};
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+
+use crate::scene::Scene;
+use crate::{arrays, errors};
+
+/// Local directions or points.
+fn vectors(a: &PyReadonlyArray2<'_, f32>, name: &str) -> PyResult<Vec<Vec3>> {
+    Ok(arrays::rows::<3>(a, name)?
+        .into_iter()
+        .map(Vec3::from_array)
+        .collect())
+}
+
+fn index(what: &str, i: usize, count: usize) -> PyResult<usize> {
+    if i < count {
+        Ok(i)
+    } else {
+        Err(errors::value(format!(
+            "{what} {i} does not exist (there are {count})"
+        )))
+    }
+}
+
+#[pymethods]
+impl Scene {
+    /// The surface that each ray meets.
+    fn ray_intersect<'py>(
+        &self,
+        py: Python<'py>,
+        origins: PyReadonlyArray2<'py, f32>,
+        directions: PyReadonlyArray2<'py, f32>,
+    ) -> PyResult<Bound<'py, PyDict>> {
+        let origins = arrays::rows::<3>(&origins, "origins")?;
+        let directions = arrays::rows::<3>(&directions, "directions")?;
+        arrays::same_rows("directions", directions.len(), origins.len())?;
+        let hits: Vec<_> = py.detach(|| {
+            let rays = origins
+                .iter()
+                .zip(&directions)
+                .map(|(o, d)| embree4::Ray::new(*o, *d));
+            rays.map(|ray| self.inner.intersect(&ray)).collect()
+        });
+        let column = |get: &dyn Fn(&pss_render::Interaction) -> Vec3| -> PyResult<Py<PyAny>> {
+            let rows: Vec<Vec3> = hits
+                .iter()
+                .map(|h| h.as_ref().map_or(Vec3::ZERO, get))
+                .collect();
+            arrays::to_rows3(py, &rows)
+        };
+        let dict = PyDict::new(py);
+        let valid = hits.iter().map(Option::is_some).collect();
+        dict.set_item("valid", arrays::to_vector::<bool>(py, valid))?;
+        dict.set_item("p", column(&|si| si.p)?)?;
+        dict.set_item("n", column(&|si| si.n)?)?;
+        dict.set_item("sh_n", column(&|si| si.shading_normal)?)?;
+        dict.set_item("sh_s", column(&|si| si.uv_frame().s)?)?;
+        let uv: Vec<[f32; 2]> = hits
+            .iter()
+            .map(|h| h.as_ref().map_or([0.0; 2], |si| si.uv.to_array()))
+            .collect();
+        dict.set_item("uv", arrays::to_rows2(py, &uv)?)?;
+        let shape = hits
+            .iter()
+            .map(|h| h.as_ref().map_or(u32::MAX, |si| si.shape))
+            .collect();
+        dict.set_item("shape", arrays::to_vector::<u32>(py, shape))?;
+        Ok(dict)
+    }
+
+    /// f·|cos θ_o| and density for local directions.
+    fn bsdf_eval_pdf(
+        &self,
+        py: Python<'_>,
+        bsdf: usize,
+        uv: PyReadonlyArray2<'_, f32>,
+        wi: PyReadonlyArray2<'_, f32>,
+        wo: PyReadonlyArray2<'_, f32>,
+    ) -> PyResult<(Py<PyAny>, Py<PyAny>)> {
+        let materials = self.inner.materials();
+        let bsdf = materials.bsdf(index("bsdf", bsdf, materials.bsdfs())?);
+        let uv = arrays::rows::<2>(&uv, "uv")?;
+        let (wi, wo) = (vectors(&wi, "wi")?, vectors(&wo, "wo")?);
+        arrays::same_rows("wi", wi.len(), uv.len())?;
+        arrays::same_rows("wo", wo.len(), uv.len())?;
+        let (values, pdfs): (Vec<Rgb>, Vec<f32>) = (0..uv.len())
+            .map(|i| {
+                bsdf.eval_pdf(
+                    ShadingPoint {
+                        uv: uv[i].into(),
+                        materials,
+                    },
+                    wi[i],
+                    wo[i],
+                )
+            })
+            .unzip();
+        Ok((arrays::to_rows3(py, &values)?, arrays::to_vector(py, pdfs)))
+    }
+
+    /// Directions drawn from a BSDF: (wo, weight, pdf), pdf 0 where the path ends.
+    fn bsdf_sample(
+        &self,
+        py: Python<'_>,
+        bsdf: usize,
+        uv: PyReadonlyArray2<'_, f32>,
+        wi: PyReadonlyArray2<'_, f32>,
+        u: PyReadonlyArray2<'_, f32>,
+    ) -> PyResult<(Py<PyAny>, Py<PyAny>, Py<PyAny>)> {
+        let materials = self.inner.materials();
+        let bsdf = materials.bsdf(index("bsdf", bsdf, materials.bsdfs())?);
+        let (uv, u) = (arrays::rows::<2>(&uv, "uv")?, arrays::rows::<2>(&u, "u")?);
+        let wi = vectors(&wi, "wi")?;
+        arrays::same_rows("wi", wi.len(), uv.len())?;
+        arrays::same_rows("u", u.len(), uv.len())?;
+        let (mut wo, mut weight, mut pdf) = (Vec::new(), Vec::new(), Vec::new());
+        for i in 0..uv.len() {
+            let at = ShadingPoint {
+                uv: uv[i].into(),
+                materials,
+            };
+            match bsdf.sample(at, wi[i], u[i]) {
+                Some(s) => {
+                    wo.push(s.wo);
+                    weight.push(s.weight);
+                    pdf.push(s.pdf);
+                }
+                None => {
+                    wo.push(Vec3::ZERO);
+                    weight.push(Rgb::ZERO);
+                    pdf.push(0.0);
+                }
+            }
+        }
+        Ok((
+            arrays::to_rows3(py, &wo)?,
+            arrays::to_rows3(py, &weight)?,
+            arrays::to_vector(py, pdf),
+        ))
+    }
+
+    /// A texture's colours.
+    fn texture_eval(
+        &self,
+        py: Python<'_>,
+        texture: usize,
+        uv: PyReadonlyArray2<'_, f32>,
+    ) -> PyResult<Py<PyAny>> {
+        let materials = self.inner.materials();
+        let texture = materials.texture(index("texture", texture, materials.textures())?);
+        let rows = arrays::rows::<2>(&uv, "uv")?;
+        let values: Vec<Rgb> = rows.into_iter().map(|uv| texture.eval(uv.into())).collect();
+        arrays::to_rows3(py, &values)
+    }
+
+    /// Light drawn from an emitter towards reference points.
+    fn emitter_sample<'py>(
+        &self,
+        py: Python<'py>,
+        emitter: usize,
+        reference: PyReadonlyArray2<'py, f32>,
+        u: PyReadonlyArray2<'py, f32>,
+    ) -> PyResult<Bound<'py, PyDict>> {
+        let emitter = index("emitter", emitter, self.inner.emitters().len())?;
+        let (reference, u) = (
+            vectors(&reference, "reference")?,
+            arrays::rows::<2>(&u, "u")?,
+        );
+        arrays::same_rows("u", u.len(), reference.len())?;
+        let samples: Vec<_> = reference
+            .iter()
+            .zip(&u)
+            .map(|(p, u)| self.inner.sample_emitter(emitter, *p, *u))
+            .collect();
+        let column = |get: &dyn Fn(&pss_render::emitter::EmitterSample) -> Vec3| {
+            let rows: Vec<Vec3> = samples
+                .iter()
+                .map(|s| s.as_ref().map_or(Vec3::ZERO, get))
+                .collect();
+            arrays::to_rows3(py, &rows)
+        };
+        let dict = PyDict::new(py);
+        dict.set_item("d", column(&|s| s.d)?)?;
+        dict.set_item("radiance", column(&|s| s.radiance)?)?;
+        dict.set_item("p", column(&|s| s.target.unwrap_or(Vec3::ZERO))?)?;
+        let pdf = samples
+            .iter()
+            .map(|s| s.as_ref().map_or(0.0, |s| s.pdf))
+            .collect();
+        dict.set_item("pdf", arrays::to_vector::<f32>(py, pdf))?;
+        Ok(dict)
+    }
+
+    /// Camera rays through film positions: (origins, directions).
+    fn film_ray(
+        &self,
+        py: Python<'_>,
+        pixels: PyReadonlyArray2<'_, f32>,
+    ) -> PyResult<(Py<PyAny>, Py<PyAny>)> {
+        let rays: Vec<_> = arrays::rows::<2>(&pixels, "pixels")?
+            .into_iter()
+            .map(|p| self.inner.sensor().ray(p))
+            .collect();
+        let origins: Vec<Vec3> = rays.iter().map(|r| Vec3::from_array(r.origin)).collect();
+        let directions: Vec<Vec3> = rays.iter().map(|r| Vec3::from_array(r.dir)).collect();
+        Ok((
+            arrays::to_rows3(py, &origins)?,
+            arrays::to_rows3(py, &directions)?,
+        ))
+    }
+}

@@ -1,0 +1,476 @@
+//! `Scene`: tracing and rendering from Python.
+
+use std::collections::HashMap;
+use std::path::PathBuf;
+use std::sync::{Arc, OnceLock};
+
+use numpy::PyReadonlyArray2;
+use pss_render::math::Rgb;
+use pss_render::{Columns, EmitterStrategy, Parametrisation, Paths, Tracer};
+use pssflow::{Budget, GuideChoice, Learner, Options, Outcome, PassPlan};
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+use serde::Deserialize;
+use serde_json::{Map, Value, json};
+
+use crate::foreign::ForeignGuide;
+use crate::guide::Guide;
+use crate::watch::watched;
+use crate::{arrays, errors};
+
+/// A scene that can be traced.
+#[pyclass(module = "pssflow._core", frozen)]
+pub(crate) struct Scene {
+    pub(crate) inner: pss_render::Scene,
+    embree: String,
+}
+
+/// One device a process: its threads and its library stay anyway.
+fn device(search_dirs: Vec<PathBuf>) -> PyResult<embree4::Device> {
+    static DEVICE: OnceLock<embree4::Device> = OnceLock::new();
+    if let Some(device) = DEVICE.get() {
+        return Ok(device.clone());
+    }
+    embree4::add_search_dirs(&search_dirs);
+    let device = embree4::Device::new().map_err(errors::load)?;
+    Ok(DEVICE.get_or_init(|| device).clone())
+}
+
+/// What Python asks for, as JSON.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Request {
+    guide: String,
+    #[serde(default)]
+    guide_options: Map<String, Value>,
+    k: usize,
+    parametrisation: String,
+    emitter_strategy: String,
+    spp: Option<u32>,
+    time: Option<f64>,
+    replay: Option<Vec<PassPlan>>,
+    uniform_fraction: Option<f32>,
+    pilot_spp: Option<u32>,
+    keep_pilot: bool,
+    seed: u64,
+    threads: usize,
+}
+
+/// A guide of the registry, with options.
+struct Named {
+    spec: &'static pss_guide::GuideSpec,
+    options: Map<String, Value>,
+}
+
+impl Learner for Named {
+    fn name(&self) -> &str {
+        self.spec.name
+    }
+
+    fn fit(
+        &self,
+        records: &pss_guide::Records<'_>,
+        seed: u64,
+        progress: &mut dyn FnMut(f32) -> bool,
+    ) -> Result<pss_guide::Fit, pss_guide::GuideError> {
+        (self.spec.fit)(&self.options, records, seed, progress)
+    }
+}
+
+pub(crate) fn parametrisation(name: &str) -> PyResult<Parametrisation> {
+    match name {
+        "bsdf" => Ok(Parametrisation::Bsdf),
+        "cosine" => Ok(Parametrisation::Cosine),
+        "uniform" => Ok(Parametrisation::Uniform),
+        _ => Err(errors::value(format!(
+            "parametrisation {name:?} is not known (known: bsdf, cosine, uniform)"
+        ))),
+    }
+}
+
+pub(crate) fn strategy(name: &str) -> PyResult<EmitterStrategy> {
+    match name {
+        "mis" => Ok(EmitterStrategy::Mis),
+        "nee" => Ok(EmitterStrategy::Nee),
+        _ => Err(errors::value(format!(
+            "emitter_strategy {name:?} is not known (known: mis, nee)"
+        ))),
+    }
+}
+
+#[pymethods]
+impl Scene {
+    #[new]
+    #[pyo3(signature = (description, arrays, search_dirs=Vec::new(), threads=0))]
+    fn new(
+        py: Python<'_>,
+        description: &str,
+        arrays: Vec<Bound<'_, PyAny>>,
+        search_dirs: Vec<PathBuf>,
+        threads: usize,
+    ) -> PyResult<Self> {
+        // Embree builds with the threads of its device; the argument is kept for callers that pass it.
+        let _ = threads;
+        let owned = arrays
+            .iter()
+            .enumerate()
+            .map(|(i, a)| arrays::any(a, i))
+            .collect::<PyResult<Vec<_>>>()?;
+        let device = device(search_dirs)?;
+        let (major, minor, patch) = device.version();
+        let embree = format!("{major}.{minor}.{patch} ({})", device.library());
+        let inner = py
+            .detach(|| pss_render::Scene::new(description, owned, &device))
+            .map_err(errors::scene)?;
+        Ok(Self { inner, embree })
+    }
+
+    /// Hash of everything that decides the image.
+    #[getter]
+    fn hash(&self) -> &str {
+        self.inner.hash()
+    }
+
+    /// Columns of the crop.
+    #[getter]
+    fn width(&self) -> u32 {
+        self.inner.film().crop_size()[0]
+    }
+
+    /// Rows of the crop.
+    #[getter]
+    fn height(&self) -> u32 {
+        self.inner.film().crop_size()[1]
+    }
+
+    /// Version and path of Embree.
+    #[getter]
+    fn embree(&self) -> &str {
+        &self.embree
+    }
+
+    /// Counts and sizes, JSON.
+    fn summary(&self) -> String {
+        json!(self.inner.summary()).to_string()
+    }
+
+    /// What each column of u decides.
+    fn columns(&self, k: usize, emitter_strategy: &str) -> PyResult<Vec<String>> {
+        let strategy = strategy(emitter_strategy)?;
+        Tracer::new(&self.inner, k, Parametrisation::Bsdf, strategy).map_err(errors::trace)?;
+        Ok(Columns::new(k, strategy).names())
+    }
+
+    /// Hash of the learned columns' meaning.
+    fn columns_hash(&self, k: usize, parametrisation: &str) -> PyResult<String> {
+        let name = self::parametrisation(parametrisation)?.name();
+        Tracer::new(&self.inner, k, Parametrisation::Bsdf, EmitterStrategy::Nee)
+            .map_err(errors::trace)?;
+        Ok(Columns::new(k, EmitterStrategy::Nee).hash(name))
+    }
+
+    /// What `emitter_strategy="auto"` means here, and why.
+    fn auto_strategy(&self) -> (&'static str, &'static str) {
+        let (strategy, reason) = self.inner.auto_strategy();
+        (strategy.name(), reason)
+    }
+
+    /// Traces one path a row of u.
+    #[pyo3(signature = (u, pixels, *, k, parametrisation, emitter_strategy, threads=0))]
+    #[allow(clippy::too_many_arguments)]
+    fn trace<'py>(
+        &self,
+        py: Python<'py>,
+        u: PyReadonlyArray2<'py, f32>,
+        pixels: PyReadonlyArray2<'py, f32>,
+        k: usize,
+        parametrisation: &str,
+        emitter_strategy: &str,
+        threads: usize,
+    ) -> PyResult<Bound<'py, PyDict>> {
+        let tracer = self.tracer(k, parametrisation, emitter_strategy)?;
+        let (u, width) = arrays::matrix(&u);
+        let pixels = arrays::rows::<2>(&pixels, "pixels")?;
+        let mut paths = Paths::new(tracer.columns());
+        paths.record = true;
+        paths.set(&u, width, &pixels).map_err(errors::trace)?;
+        drop(u);
+        let blocks = py
+            .detach(|| pssflow::trace_blocks(&tracer, &paths, threads))
+            .map_err(errors::render)?;
+        traced(py, &blocks, k)
+    }
+
+    /// All uniform paths of a pilot.
+    #[pyo3(signature = (*, spp, k, parametrisation, emitter_strategy, seed=0, threads=0))]
+    #[allow(clippy::too_many_arguments)]
+    fn pilot<'py>(
+        &self,
+        py: Python<'py>,
+        spp: u32,
+        k: usize,
+        parametrisation: &str,
+        emitter_strategy: &str,
+        seed: u64,
+        threads: usize,
+    ) -> PyResult<Bound<'py, PyDict>> {
+        let tracer = self.tracer(k, parametrisation, emitter_strategy)?;
+        if spp == 0 {
+            return Err(errors::value("spp = 0: must be at least 1"));
+        }
+        let width = tracer.columns().width();
+        let (paths, blocks) = py
+            .detach(|| {
+                let paths = pssflow::uniform_paths(&tracer, seed, spp);
+                pssflow::trace_blocks(&tracer, &paths, threads).map(|blocks| (paths, blocks))
+            })
+            .map_err(errors::render)?;
+        let dict = traced(py, &blocks, k)?;
+        dict.set_item("pixels", arrays::to_rows2(py, &paths.film)?)?;
+        dict.set_item("g", arrays::to_vector(py, vec![1f32; paths.len()]))?;
+        dict.set_item("u", arrays::to_matrix(py, paths.u, width)?)?;
+        Ok(dict)
+    }
+
+    /// Renders; see the stub for the request and what comes back.
+    #[pyo3(signature = (options, guide=None, progress=None))]
+    fn render<'py>(
+        &self,
+        py: Python<'py>,
+        options: &str,
+        guide: Option<Bound<'py, PyAny>>,
+        progress: Option<Py<PyAny>>,
+    ) -> PyResult<Bound<'py, PyDict>> {
+        let request: Request = serde_json::from_str(options)
+            .map_err(|e| errors::value(format!("render options: {e}")))?;
+        let mut foreign = None;
+        let choice = self.choice(&request, guide.as_ref(), &mut foreign)?;
+        let options = self.options(&request, choice)?;
+        let outcome = watched(py, progress.as_ref(), |shared| {
+            pssflow::render(&self.inner, &options, shared)
+        })?;
+        // What the foreign guide raised is the cause of whatever else went wrong.
+        if let Some(error) = foreign.as_ref().and_then(ForeignGuide::take_error) {
+            return Err(error);
+        }
+        let outcome = outcome.map_err(errors::render)?;
+
+        let shape = [outcome.height as usize, outcome.width as usize, 3];
+        let dict = PyDict::new(py);
+        dict.set_item("record", record(&outcome, &options).to_string())?;
+        let guide = match (&outcome.guide, &foreign, guide) {
+            (Some(_), Some(_), Some(object)) => Some(object.unbind()),
+            (Some(inner), _, _) => Some(
+                Py::new(
+                    py,
+                    Guide {
+                        inner: Arc::clone(inner),
+                    },
+                )?
+                .into_any(),
+            ),
+            (None, _, _) => None,
+        };
+        dict.set_item("guide", guide)?;
+        dict.set_item("image", arrays::to_cube(py, outcome.image, shape)?)?;
+        dict.set_item("variance", arrays::to_cube(py, outcome.variance, shape)?)?;
+        Ok(dict)
+    }
+
+    /// Times the Embree queries of a render alone.
+    #[pyo3(signature = (*, spp, k, threads=0))]
+    fn rays_alone(
+        &self,
+        py: Python<'_>,
+        spp: u32,
+        k: usize,
+        threads: usize,
+    ) -> PyResult<HashMap<&'static str, f64>> {
+        let tracer = Tracer::new(&self.inner, k, Parametrisation::Bsdf, EmitterStrategy::Mis)
+            .map_err(errors::trace)?;
+        let timing = py
+            .detach(|| pssflow::rays_alone(&tracer, spp, threads))
+            .map_err(errors::render)?;
+        Ok(HashMap::from([
+            ("seconds", timing.seconds),
+            ("rays", timing.rays as f64),
+            (
+                "rays_per_path",
+                timing.rays as f64 / timing.paths.max(1) as f64,
+            ),
+        ]))
+    }
+}
+
+impl Scene {
+    fn tracer(
+        &self,
+        k: usize,
+        parametrisation: &str,
+        emitter_strategy: &str,
+    ) -> PyResult<Tracer<'_>> {
+        Tracer::new(
+            &self.inner,
+            k,
+            self::parametrisation(parametrisation)?,
+            strategy(emitter_strategy)?,
+        )
+        .map_err(errors::trace)
+    }
+
+    fn choice(
+        &self,
+        request: &Request,
+        guide: Option<&Bound<'_, PyAny>>,
+        foreign: &mut Option<ForeignGuide>,
+    ) -> PyResult<GuideChoice> {
+        let given = || {
+            guide.ok_or_else(|| {
+                errors::value(format!("guide = {:?} needs a guide object", request.guide))
+            })
+        };
+        match request.guide.as_str() {
+            "none" => Ok(GuideChoice::None),
+            "ready" => {
+                let guide = given()?.extract::<PyRef<'_, Guide>>()?;
+                Ok(GuideChoice::Ready(Arc::clone(&guide.inner)))
+            }
+            "foreign" => {
+                let object = ForeignGuide::new(given()?, 2 * request.k + 1)?;
+                *foreign = Some(object.clone());
+                Ok(GuideChoice::Learn(Arc::new(object)))
+            }
+            name => {
+                let spec = pss_guide::find(name).map_err(errors::guide)?;
+                // Before minutes of pilot, not after.
+                (spec.validate)(&request.guide_options).map_err(errors::guide)?;
+                let options = request.guide_options.clone();
+                Ok(GuideChoice::Learn(Arc::new(Named { spec, options })))
+            }
+        }
+    }
+
+    fn options(&self, request: &Request, guide: GuideChoice) -> PyResult<Options> {
+        let budget = match (&request.replay, request.time, request.spp) {
+            (Some(passes), _, _) => Budget::Replay(passes.clone()),
+            (None, Some(time), _) => Budget::Time(time),
+            (None, None, Some(spp)) => Budget::Spp(spp),
+            (None, None, None) => {
+                return Err(errors::value("one of spp, time and replay must be given"));
+            }
+        };
+        let defaults = Options::default();
+        Ok(Options {
+            guide,
+            k: request.k,
+            parametrisation: parametrisation(&request.parametrisation)?,
+            strategy: strategy(&request.emitter_strategy)?,
+            budget,
+            uniform_fraction: request
+                .uniform_fraction
+                .unwrap_or(defaults.uniform_fraction),
+            pilot_spp: request.pilot_spp,
+            keep_pilot: request.keep_pilot,
+            seed: request.seed,
+            threads: request.threads,
+            max_records: defaults.max_records,
+        })
+    }
+}
+
+/// The record of a render: what was counted, chosen and timed.
+fn record(outcome: &Outcome, options: &Options) -> Value {
+    let mut record = json!(outcome.rendered.counts);
+    let mut pilot = json!(outcome.pilot.counts);
+    pilot["nonzero_share"] = json!(outcome.pilot.counts.nonzero_share());
+    let summary = json!({
+        "chosen": outcome.chosen,
+        "a": outcome.uniform_fraction,
+        "k": options.k,
+        "parametrisation": options.parametrisation.name(),
+        "emitter_strategy": options.strategy.name(),
+        "seed": options.seed,
+        "threads": outcome.threads,
+        "nonzero_share": outcome.rendered.counts.nonzero_share(),
+        "pilot": pilot,
+        "mean": outcome.mean(),
+        "variance": outcome.relative_variance(),
+        "max_weight": outcome.rendered.max_weight,
+        "max_contribution": outcome.rendered.max_contribution(),
+        "ess": outcome.rendered.ess(),
+        "passes": outcome.passes,
+        "notes": outcome.notes,
+        "training": outcome.training,
+        "seconds": outcome.seconds,
+    });
+    if let (Some(record), Value::Object(summary)) = (record.as_object_mut(), summary) {
+        record.extend(summary);
+    }
+    record
+}
+
+/// Blocks of traced paths as one dictionary of arrays.
+fn traced<'py>(py: Python<'py>, blocks: &[Paths], k: usize) -> PyResult<Bound<'py, PyDict>> {
+    let all = |get: &dyn Fn(&Paths) -> &Vec<Rgb>| -> Vec<Rgb> {
+        blocks.iter().flat_map(|b| get(b).iter().copied()).collect()
+    };
+    let (nee, bsdf) = (all(&|b| &b.f_nee), all(&|b| &b.f_bsdf));
+    let sum: Vec<Rgb> = nee.iter().zip(&bsdf).map(|(a, b)| *a + *b).collect();
+    let contexts = || blocks.iter().flat_map(|b| &b.contexts);
+    let n = sum.len();
+    let cube = |get: &dyn Fn(&pss_render::VertexContext) -> [f32; 3]| {
+        arrays::to_cube(py, contexts().flat_map(get).collect(), [n, k, 3])
+    };
+    let dict = PyDict::new(py);
+    dict.set_item("f", arrays::to_rows3(py, &sum)?)?;
+    dict.set_item("f_nee", arrays::to_rows3(py, &nee)?)?;
+    dict.set_item("f_bsdf", arrays::to_rows3(py, &bsdf)?)?;
+    let found = blocks
+        .iter()
+        .flat_map(|b| b.found.iter().copied())
+        .collect();
+    dict.set_item("found", arrays::to_vector::<bool>(py, found))?;
+    dict.set_item("position", cube(&|c| c.position)?)?;
+    dict.set_item("normal", cube(&|c| c.normal)?)?;
+    dict.set_item("outgoing", cube(&|c| c.outgoing)?)?;
+    let pixel: Vec<[f32; 2]> = blocks.iter().flat_map(Paths::pixels).collect();
+    dict.set_item("pixel", arrays::to_rows2(py, &pixel)?)?;
+    let emitter = blocks.iter().flat_map(Paths::emitters).collect();
+    dict.set_item("emitter", arrays::to_vector::<u32>(py, emitter))?;
+    Ok(dict)
+}
+
+/// Writes layers of (h, w, 3) values as OpenEXR.
+#[pyfunction]
+pub(crate) fn write_exr(
+    path: PathBuf,
+    layers: HashMap<String, numpy::PyReadonlyArray3<'_, f32>>,
+) -> PyResult<()> {
+    use numpy::PyUntypedArrayMethods;
+    let mut size = None;
+    let mut owned = Vec::new();
+    for (name, array) in &layers {
+        let shape = array.shape();
+        if shape[2] != 3
+            || shape[0] == 0
+            || shape[1] == 0
+            || *size.get_or_insert((shape[1], shape[0])) != (shape[1], shape[0])
+        {
+            return Err(errors::value(format!(
+                "layer {name:?} has shape {shape:?}; all layers must be (height, width, 3) of one size"
+            )));
+        }
+        owned.push((
+            name.as_str(),
+            array.as_array().iter().copied().collect::<Vec<f32>>(),
+        ));
+    }
+    let Some((width, height)) = size else {
+        return Err(errors::value(
+            "layers is empty; give at least the image, under the key \"\"",
+        ));
+    };
+    owned.sort_by_key(|(name, _)| *name);
+    let slices: Vec<(&str, &[f32])> = owned.iter().map(|(n, v)| (*n, v.as_slice())).collect();
+    pssflow::output::write_exr(&path, width as u32, height as u32, &slices).map_err(errors::render)
+}

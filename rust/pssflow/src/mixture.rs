@@ -1,0 +1,73 @@
+//! The joint defensive mixture, and the one place where f is divided by a density.
+
+use pss_render::math::Rgb;
+
+/// m = a + (1 − a)·q over all guided decisions of a path together: one coin a path makes either all of
+/// them from q or all of them uniform, and both cases are divided by the same m. So 1/m ≤ 1/a for any
+/// number of bounces and any composite of guides, and an unguided path (q ≡ 1) has m = 1.
+///
+/// This is one-sample multiple importance sampling with the balance heuristic (Veach 1997, §9.2.4;
+/// Hesterberg 1995 calls it a defensive mixture).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Mixture {
+    /// Share of uniform paths, in [0, 1]; 0 is the thesis' estimator, whose weights have no bound.
+    pub uniform_fraction: f32,
+}
+
+impl Mixture {
+    /// m for a product of guide densities `q`.
+    #[inline]
+    pub fn density(&self, q: f32) -> f32 {
+        let a = self.uniform_fraction;
+        // At a = 1, an infinite q must not make 0·∞.
+        if a >= 1.0 { 1.0 } else { a + (1.0 - a) * q }
+    }
+
+    /// Whether the coin `c` ∈ [0, 1) sends a path to the guide.
+    #[inline]
+    pub fn is_guided(&self, coin: f32) -> bool {
+        coin >= self.uniform_fraction
+    }
+
+    /// f ÷ m, each term by the density of the numbers that it uses.
+    #[inline]
+    pub fn divide(&self, f_nee: Rgb, q_nee: f32, f_bsdf: Rgb, q_bsdf: f32) -> Rgb {
+        let mut estimate = Rgb::ZERO;
+        // A term of zero stays zero, also where its density is zero.
+        if f_nee != Rgb::ZERO {
+            estimate += f_nee / self.density(q_nee);
+        }
+        if f_bsdf != Rgb::ZERO {
+            estimate += f_bsdf / self.density(q_bsdf);
+        }
+        estimate
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_weight_is_bounded_by_the_uniform_fraction() {
+        for a in [0.1, 0.25, 0.5, 1.0] {
+            let m = Mixture {
+                uniform_fraction: a,
+            };
+            for q in [0.0, 1e-30, 1e-3, 1.0, 1e10, f32::INFINITY] {
+                let w = 1.0 / m.density(q);
+                assert!((0.0..=1.0 / a + 1e-6).contains(&w), "a {a} q {q}: {w}");
+            }
+        }
+    }
+
+    #[test]
+    fn without_a_guide_nothing_is_divided() {
+        let m = Mixture {
+            uniform_fraction: 0.1,
+        };
+        let f = Rgb::new(1.0, 2.0, 3.0);
+        let estimate = m.divide(f, 1.0, f, 1.0);
+        assert!((estimate - f * 2.0).length() < 1e-5);
+    }
+}

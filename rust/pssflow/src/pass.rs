@@ -1,0 +1,302 @@
+//! One pass over the image: every pixel gets the same number of paths, from one frozen source of numbers.
+//!
+//! The image is cut into tiles and each tile's samples into chunks, the same whatever the number of
+//! threads; their sums are merged in that order. So one seed gives one image, bit for bit.
+
+use pss_guide::Guide;
+use pss_render::math::luminance;
+use pss_render::{Accumulator, Film, Paths, Tile, Tracer, Uniform};
+use pss_rng::{Purpose, Stream, to_unit};
+use rayon::prelude::*;
+
+use crate::error::RenderError;
+use crate::mixture::Mixture;
+use crate::numbers::GuidedNumbers;
+use crate::progress::{Phase, Progress};
+use crate::statistics::Statistics;
+
+/// Edge of a tile in pixels.
+const TILE: u32 = 32;
+/// Paths of a block that goes through the stages together: large enough for a network's batch, small
+/// enough for the cache.
+pub(crate) const BLOCK: usize = 1024;
+/// Samples of a pixel that one piece of work holds at most.
+const CHUNK: u32 = 16;
+/// Pieces of work between two merges: bounds the memory of unmerged sums.
+const BATCH: usize = 128;
+
+/// What all passes of a render share.
+pub struct PassContext<'a> {
+    /// The tracer.
+    pub tracer: Tracer<'a>,
+    /// Seed of the paths' numbers.
+    pub seed: u64,
+    /// Listener.
+    pub progress: &'a dyn Progress,
+    /// Threads.
+    pub pool: &'a rayon::ThreadPool,
+    /// Training paths kept at most.
+    pub max_records: usize,
+}
+
+/// Appends the uniform numbers of one path, and its film position, to a block; returns its coin and the
+/// number that decides whether it is recorded.
+pub(crate) fn path_numbers(
+    stream: &Stream,
+    film: &Film,
+    [x, y]: [u32; 2],
+    sample: u32,
+    width: usize,
+    paths: &mut Paths,
+) -> [f32; 2] {
+    // Numbered over the whole film: a crop renders the same samples as the full image.
+    let [ox, oy] = film.crop_offset();
+    let index = (y + oy) * film.size()[0] + x + ox;
+    let block = |group: u32| stream.block(index, sample, group).map(to_unit);
+    let [fx, fy, coin, thin] = block(0);
+    paths.film.push([x as f32 + fx, y as f32 + fy]);
+    let end = paths.u.len() + width;
+    let mut group = 1;
+    while paths.u.len() < end {
+        paths.u.extend(block(group));
+        group += 1;
+    }
+    paths.u.truncate(end);
+    [coin, thin]
+}
+
+/// One pass.
+pub(crate) struct Pass<'a> {
+    pub(crate) phase: Phase,
+    /// First sample index; samples of different passes must not overlap.
+    pub(crate) first_sample: u32,
+    pub(crate) spp: u32,
+    /// `None`: uniform numbers.
+    pub(crate) guide: Option<(&'a dyn Guide, Mixture)>,
+    /// Share of the light-carrying paths to record, 0 for none.
+    pub(crate) record: f32,
+    /// Share of the phase that is done before and after this pass, for the progress bar.
+    pub(crate) span: (f32, f32),
+}
+
+/// Light-carrying paths of a pilot, and the number of those that carry none.
+#[derive(Clone, Debug, Default)]
+pub struct PilotRecords {
+    /// Learned numbers, 2k + 1 a path.
+    pub u: Vec<f32>,
+    /// Luminance of f.
+    pub f: Vec<f32>,
+    /// Largest RGB component of f.
+    pub f_max: Vec<f32>,
+    /// Density that each was drawn from.
+    pub g: Vec<f32>,
+    /// Film position, [0, 1)².
+    pub pixel: Vec<[f32; 2]>,
+    /// Paths without light.
+    pub zeros: u64,
+}
+
+impl PilotRecords {
+    pub(crate) fn extend(&mut self, mut other: Self) {
+        self.append(&mut other);
+    }
+
+    fn append(&mut self, other: &mut Self) {
+        self.u.append(&mut other.u);
+        self.f.append(&mut other.f);
+        self.f_max.append(&mut other.f_max);
+        self.g.append(&mut other.g);
+        self.pixel.append(&mut other.pixel);
+        self.zeros += other.zeros;
+    }
+}
+
+/// What a pass adds up to.
+pub(crate) struct PassResult {
+    pub(crate) statistics: Statistics,
+    pub(crate) records: PilotRecords,
+}
+
+struct Piece {
+    sums: Accumulator,
+    result: PassResult,
+}
+
+impl PassContext<'_> {
+    /// Renders `pass` and adds it to `image`.
+    pub(crate) fn render(
+        &self,
+        pass: &Pass<'_>,
+        image: &mut Accumulator,
+    ) -> Result<PassResult, RenderError> {
+        let pieces = self.pieces(pass);
+        let mut total = PassResult {
+            statistics: Statistics::default(),
+            records: PilotRecords::default(),
+        };
+        let (start, end) = pass.span;
+        for (batch, work) in pieces.chunks(BATCH).enumerate() {
+            let done: Vec<Option<Piece>> = self.pool.install(|| {
+                work.par_iter()
+                    .map(|&(tile, first, spp)| {
+                        (!self.progress.cancelled()).then(|| self.piece(pass, tile, first, spp))
+                    })
+                    .collect()
+            });
+            for piece in done {
+                let Some(mut piece) = piece else {
+                    return Err(RenderError::Cancelled);
+                };
+                image.merge(&piece.sums);
+                total.statistics.add(&piece.result.statistics);
+                total.records.append(&mut piece.result.records);
+            }
+            let share = ((batch * BATCH + work.len()) as f32) / pieces.len() as f32;
+            self.progress
+                .update(pass.phase, start + (end - start) * share);
+        }
+        Ok(total)
+    }
+
+    /// The pass cut into (tile, first sample, samples), in the order in which they are merged.
+    fn pieces(&self, pass: &Pass<'_>) -> Vec<(Tile, u32, u32)> {
+        let [width, height] = self.tracer.scene().film().crop_size();
+        let mut pieces = Vec::new();
+        for first in (0..pass.spp).step_by(CHUNK as usize) {
+            let spp = (pass.spp - first).min(CHUNK);
+            for y in (0..height).step_by(TILE as usize) {
+                for x in (0..width).step_by(TILE as usize) {
+                    let tile = Tile {
+                        x,
+                        y,
+                        width: (width - x).min(TILE),
+                        height: (height - y).min(TILE),
+                    };
+                    pieces.push((tile, pass.first_sample + first, spp));
+                }
+            }
+        }
+        pieces
+    }
+
+    /// All paths of a tile and a chunk of samples, in blocks.
+    fn piece(&self, pass: &Pass<'_>, tile: Tile, first_sample: u32, spp: u32) -> Piece {
+        let scene = self.tracer.scene();
+        let film = scene.film();
+        let columns = self.tracer.columns();
+        let stream = Stream::new(self.seed, Purpose::Path);
+        let mut piece = Piece {
+            sums: Accumulator::new(film, tile),
+            result: PassResult {
+                statistics: Statistics::default(),
+                records: PilotRecords::default(),
+            },
+        };
+        let mut paths = Paths::new(columns);
+        let mut guided = pass.guide.map(|(guide, _)| GuidedNumbers::new(guide));
+        let mixture = pass.guide.map_or(
+            Mixture {
+                uniform_fraction: 1.0,
+            },
+            |(_, m)| m,
+        );
+        let mut coins: Vec<[f32; 2]> = Vec::with_capacity(BLOCK);
+
+        // Samples of a pixel lie next to each other, so that camera rays come in coherent packets.
+        let pixels = tile.width * tile.height;
+        let total = u64::from(pixels) * u64::from(spp);
+        let mut next = 0u64;
+        while next < total {
+            let n = (total - next).min(BLOCK as u64);
+            paths.film.clear();
+            paths.u.clear();
+            coins.clear();
+            for i in next..next + n {
+                let (pixel, sample) = ((i / u64::from(spp)) as u32, (i % u64::from(spp)) as u32);
+                let (x, y) = (tile.x + pixel % tile.width, tile.y + pixel / tile.width);
+                let sample = first_sample + sample;
+                coins.push(path_numbers(
+                    &stream,
+                    film,
+                    [x, y],
+                    sample,
+                    columns.width(),
+                    &mut paths,
+                ));
+            }
+            next += n;
+
+            match &mut guided {
+                Some(numbers) => {
+                    numbers.toss(coins.iter().map(|c| c[0]), mixture);
+                    self.tracer.trace(&mut paths, numbers);
+                }
+                None => self.tracer.trace(&mut paths, &mut Uniform),
+            }
+            self.collect(pass, &paths, &coins, mixture, &mut piece);
+        }
+        piece
+    }
+
+    /// Divides a block by its densities and adds it to the film, the counts and the records.
+    fn collect(
+        &self,
+        pass: &Pass<'_>,
+        paths: &Paths,
+        coins: &[[f32; 2]],
+        mixture: Mixture,
+        piece: &mut Piece,
+    ) {
+        let film = self.tracer.scene().film();
+        let columns = self.tracer.columns();
+        let statistics = &mut piece.result.statistics;
+        let counts = &mut statistics.counts;
+        counts.camera_rays += paths.len() as u64;
+        counts.paths_found += paths.found.iter().filter(|&&f| f).count() as u64;
+        counts.non_finite += paths.non_finite;
+        if pass.guide.is_some() {
+            let row_is_outside = |u: &[f32]| {
+                u[..columns.learned()]
+                    .iter()
+                    .any(|x| !(0.0..1.0).contains(x))
+            };
+            counts.outside += paths
+                .u
+                .chunks_exact(columns.width())
+                .filter(|u| row_is_outside(u))
+                .count() as u64;
+        }
+        let [width, height] = film.crop_size().map(|n| n as f32);
+        for (i, &[_, thin]) in coins.iter().enumerate() {
+            let mut estimate = mixture.divide(
+                paths.f_nee[i],
+                paths.q_nee[i],
+                paths.f_bsdf[i],
+                paths.q_bsdf[i],
+            );
+            if !estimate.is_finite() {
+                piece.result.statistics.counts.non_finite += 1;
+                estimate = pss_render::math::Rgb::ZERO;
+            }
+            piece.sums.add(film, paths.film[i], estimate);
+            let f = paths.f(i);
+            if f == pss_render::math::Rgb::ZERO {
+                continue;
+            }
+            let weight = 1.0
+                / mixture
+                    .density(paths.q_nee[i])
+                    .min(mixture.density(paths.q_bsdf[i]));
+            piece.result.statistics.add_estimate(estimate, weight);
+            if thin < pass.record {
+                let r = &mut piece.result.records;
+                r.u.extend_from_slice(&paths.u[i * columns.width()..][..columns.learned()]);
+                r.f.push(luminance(f));
+                r.f_max.push(f.max_element());
+                r.g.push(1.0);
+                let [x, y] = paths.film[i];
+                r.pixel.push([x / width, y / height]);
+            }
+        }
+    }
+}

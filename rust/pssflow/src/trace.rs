@@ -1,0 +1,112 @@
+//! Given samples rendered, and rays timed: what studies ask of the tracer beside whole images.
+
+use std::time::Instant;
+
+use pss_render::{Paths, Tracer, Uniform};
+use pss_rng::{Purpose, Stream};
+use rayon::prelude::*;
+
+use crate::error::RenderError;
+use crate::estimator::thread_pool;
+use crate::pass::{BLOCK, path_numbers};
+
+/// Uniform paths of `spp` samples a pixel, rows and pixels in order, not yet traced. The numbers are those
+/// that a render with the same seed uses.
+pub fn uniform_paths(tracer: &Tracer<'_>, seed: u64, spp: u32) -> Paths {
+    let film = tracer.scene().film();
+    let [width, height] = film.crop_size();
+    let columns = tracer.columns();
+    let stream = Stream::new(seed, Purpose::Path);
+    let mut paths = Paths::new(columns);
+    for y in 0..height {
+        for x in 0..width {
+            for sample in 0..spp {
+                path_numbers(&stream, film, [x, y], sample, columns.width(), &mut paths);
+            }
+        }
+    }
+    paths
+}
+
+/// Traces paths in blocks, in parallel, and records their contexts; the blocks come back in order.
+///
+/// # Errors
+/// [`RenderError::Threads`].
+pub fn trace_blocks(
+    tracer: &Tracer<'_>,
+    paths: &Paths,
+    threads: usize,
+) -> Result<Vec<Paths>, RenderError> {
+    let width = tracer.columns().width();
+    let pool = thread_pool(threads)?;
+    let blocks = pool.install(|| {
+        paths
+            .film
+            .par_chunks(BLOCK)
+            .zip(paths.u.par_chunks(BLOCK * width))
+            .map(|(film, u)| {
+                let mut block = Paths::new(tracer.columns());
+                block.record = true;
+                block.film.extend_from_slice(film);
+                block.u.extend_from_slice(u);
+                tracer.trace(&mut block, &mut Uniform);
+                block
+            })
+            .collect()
+    });
+    Ok(blocks)
+}
+
+/// The time of a set of rays.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RayTiming {
+    /// Wall time of the queries alone.
+    pub seconds: f64,
+    /// Queries: nearest hits and shadow rays.
+    pub rays: u64,
+    /// Paths that asked for them.
+    pub paths: u64,
+}
+
+/// Renders `spp` uniform samples a pixel while noting every ray, then times these rays alone: the floor
+/// under the time of a path.
+///
+/// # Errors
+/// [`RenderError::Threads`].
+pub fn rays_alone(tracer: &Tracer<'_>, spp: u32, threads: usize) -> Result<RayTiming, RenderError> {
+    let pool = thread_pool(threads)?;
+    let paths = uniform_paths(tracer, 0, spp);
+    let width = tracer.columns().width();
+    let logs: Vec<pss_render::path::RayLog> = pool.install(|| {
+        paths
+            .film
+            .par_chunks(BLOCK)
+            .zip(paths.u.par_chunks(BLOCK * width))
+            .map(|(film, u)| {
+                let mut block = Paths::new(tracer.columns());
+                block.rays = Some(Default::default());
+                block.film.extend_from_slice(film);
+                block.u.extend_from_slice(u);
+                tracer.trace(&mut block, &mut Uniform);
+                block.rays.unwrap_or_default()
+            })
+            .collect()
+    });
+    let accel = tracer.scene().accel();
+    let start = Instant::now();
+    let rays = pool.install(|| {
+        logs.par_iter()
+            .map(|log| std::hint::black_box(log.replay(accel)))
+            .sum::<u64>()
+    });
+    let seconds = start.elapsed().as_secs_f64();
+    let _ = rays;
+    Ok(RayTiming {
+        seconds,
+        rays: logs
+            .iter()
+            .map(pss_render::path::RayLog::len)
+            .sum::<usize>() as u64,
+        paths: paths.len() as u64,
+    })
+}

@@ -1,0 +1,274 @@
+"""BSDFs by value: ours beside Mitsuba's for the same (uv, wi, wo); samples beside our own density; energy.
+
+Directions are local, so no tangent frame enters here: `test_rays.py` compares the frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from pssflow import _core
+from tests.conftest import LLVM
+from tests.support.chi2 import sphere_chi2
+from tests.support.core import core_scene
+from tests.support.values import (
+    F32,
+    direction_pairs,
+    disagreements,
+    first_rows,
+    interaction,
+    points,
+    sphere_directions,
+    unit_interval,
+    vector3,
+)
+
+pytestmark = pytest.mark.parity
+
+Description = dict[str, Any]
+
+
+def _rgb(*value: float) -> Description:
+    return {"type": "rgb", "value": list(value)}
+
+
+def _bitmap(seed: int, channels: int) -> Description:
+    texels = np.random.default_rng(seed).uniform(0.1, 0.9, (7, 5, channels)).astype(np.float32)
+    return {"type": "bitmap", "bitmap": mi.Bitmap(texels), "raw": True}
+
+
+def _plastic(**options: Any) -> Description:
+    return {"type": "roughplastic", "diffuse_reflectance": _rgb(0.6, 0.4, 0.2)} | options
+
+
+def _gold(**options: Any) -> Description:
+    return {
+        "type": "roughconductor",
+        "eta": _rgb(0.14, 0.37, 1.44),
+        "k": _rgb(3.98, 2.39, 1.6),
+    } | options
+
+
+BSDFS: dict[str, Callable[[], Description]] = {
+    "diffuse": lambda: {"type": "diffuse", "reflectance": _rgb(0.2, 0.5, 0.8)},
+    "diffuse-textured": lambda: {"type": "diffuse", "reflectance": _bitmap(1, 3)},
+    "twosided": lambda: {
+        "type": "twosided",
+        "bsdf": {"type": "diffuse", "reflectance": _rgb(0.2, 0.5, 0.8)},
+    },
+    "twosided-two": lambda: {
+        "type": "twosided",
+        "front": _plastic(alpha=0.2),
+        "back": _gold(alpha=0.3),
+    },
+    "plastic-beckmann": lambda: _plastic(distribution="beckmann", alpha=0.15),
+    "plastic-ggx": lambda: _plastic(distribution="ggx", alpha=0.3, int_ior=1.8, ext_ior=1.1),
+    "plastic-nonlinear": lambda: _plastic(alpha=0.25, nonlinear=True),
+    "plastic-all-normals": lambda: _plastic(distribution="ggx", alpha=0.35, sample_visible=False),
+    "plastic-beckmann-all-normals": lambda: _plastic(alpha=0.35, sample_visible=False),
+    "plastic-textured": lambda: _plastic(
+        alpha=0.2,
+        diffuse_reflectance=_bitmap(2, 3),
+        specular_reflectance=_bitmap(3, 3),
+        nonlinear=True,
+    ),
+    "conductor-beckmann": lambda: _gold(distribution="beckmann", alpha=0.1),
+    "conductor-ggx": lambda: _gold(distribution="ggx", alpha=0.25),
+    "conductor-beckmann-anisotropic": lambda: _gold(alpha_u=0.4, alpha_v=0.12),
+    "conductor-ggx-anisotropic": lambda: _gold(distribution="ggx", alpha_u=0.15, alpha_v=0.5),
+    "conductor-all-normals": lambda: _gold(distribution="ggx", alpha=0.3, sample_visible=False),
+    "conductor-beckmann-all-normals": lambda: _gold(alpha=0.3, sample_visible=False),
+    "conductor-anisotropic-all-normals": lambda: _gold(
+        distribution="ggx", alpha_u=0.2, alpha_v=0.45, sample_visible=False
+    ),
+    "conductor-beckmann-anisotropic-all-normals": lambda: _gold(
+        alpha_u=0.45, alpha_v=0.2, sample_visible=False
+    ),
+    "conductor-textured": lambda: _gold(alpha=_bitmap(4, 1), specular_reflectance=_bitmap(5, 3)),
+    "blend": lambda: {
+        "type": "blendbsdf",
+        "weight": 0.3,
+        "a": {"type": "diffuse", "reflectance": _rgb(0.7, 0.3, 0.5)},
+        "b": _gold(distribution="ggx", alpha=0.2),
+    },
+    "blend-nested-textured": lambda: {
+        "type": "twosided",
+        "nested": {
+            "type": "blendbsdf",
+            "weight": _bitmap(6, 1),
+            "a": {
+                "type": "blendbsdf",
+                "weight": 0.6,
+                "a": _plastic(alpha=0.3),
+                "b": {"type": "diffuse", "reflectance": _bitmap(7, 3)},
+            },
+            "b": _gold(alpha_u=0.2, alpha_v=0.4),
+        },
+    },
+}
+"""Each on a sphere of its own in the gallery."""
+
+WHITE: dict[str, Callable[[], Description]] = {
+    "white-diffuse": lambda: {"type": "diffuse", "reflectance": _rgb(1, 1, 1)},
+    "white-plastic": lambda: _plastic(alpha=0.2, diffuse_reflectance=_rgb(1, 1, 1)),
+    "white-plastic-nonlinear": lambda: _plastic(
+        alpha=0.2, diffuse_reflectance=_rgb(1, 1, 1), nonlinear=True
+    ),
+    "white-plastic-rough": lambda: _plastic(
+        distribution="ggx", alpha=0.7, diffuse_reflectance=_rgb(1, 1, 1)
+    ),
+    "white-mirror": lambda: {"type": "roughconductor", "material": "none", "alpha": 0.15},
+    "white-mirror-ggx": lambda: {
+        "type": "roughconductor",
+        "material": "none",
+        "distribution": "ggx",
+        "alpha_u": 0.6,
+        "alpha_v": 0.2,
+    },
+    "white-mirror-all-normals": lambda: {
+        "type": "roughconductor",
+        "material": "none",
+        "distribution": "ggx",
+        "alpha": 0.5,
+        "sample_visible": False,
+    },
+}
+"""Nothing is absorbed, so that a surplus of energy shows."""
+
+
+class Gallery(NamedTuple):
+    """All BSDFs in one scene, on both sides."""
+
+    core: _core.Scene
+    index: dict[str, int]
+    """BSDF of the core, by name."""
+    theirs: dict[str, mi.BSDF]
+
+
+@pytest.fixture(scope="module")
+def gallery() -> Gallery:
+    mi.set_variant(LLVM)
+    camera = {"type": "perspective", "film": {"type": "hdrfilm", "width": 8, "height": 8}}
+    balls = {
+        name: {"type": "sphere", "center": [3.0 * i, 0, 0], "id": name, "bsdf": make()}
+        for i, (name, make) in enumerate((BSDFS | WHITE).items())
+    }
+    scene = mi.load_dict({"type": "scene", "camera": camera} | balls)
+    core, exported = core_scene(scene)
+    index = {shape["id"]: shape["bsdf"] for shape in exported.description["shapes"]}
+    return Gallery(core, index, {shape.id(): shape.bsdf() for shape in scene.shapes()})
+
+
+@pytest.mark.parametrize("name", BSDFS)
+def test_value_and_density_are_mitsubas(name: str, gallery: Gallery) -> None:
+    """20,000 triples (uv, wi, wo): value and density within 1e-3, but for at most 20 within .6° of the horizon.
+
+    There both sides lose digits to cancellation.
+    """
+    rng = np.random.default_rng(11)
+    n = 20_000
+    uv = rng.uniform(-1, 2, (n, 2)).astype(np.float32)
+    wi, wo = direction_pairs(rng, n)
+    value, pdf = gallery.core.bsdf_eval_pdf(gallery.index[name], uv, wi, wo)
+
+    si = interaction(uv, wi)
+    their_value, their_pdf = gallery.theirs[name].eval_pdf(mi.BSDFContext(), si, vector3(wo))
+    their_value, their_pdf = points(their_value), points(their_pdf)
+    assert np.count_nonzero(their_pdf) > n / 5
+
+    wrong = disagreements(value, their_value, rel=1e-3, floor=1e-6)
+    wrong |= disagreements(pdf, their_pdf, rel=1e-3, floor=1e-6)
+    grazing = np.minimum(np.abs(wi[:, 2]), np.abs(wo[:, 2])) < 0.01
+    rows = {"uv": uv, "wi": wi, "wo": wo, "value": value, "theirs": their_value}
+    rows |= {"pdf": pdf, "their_pdf": their_pdf}
+    assert not (wrong & ~grazing).any(), first_rows(wrong & ~grazing, **rows)
+    assert np.count_nonzero(wrong) <= 20, first_rows(wrong, **rows)
+
+
+INCIDENT = {
+    "normal": (0.0, 0.0, 1.0),
+    "slanted": (0.5, -0.3, 0.6),
+    "grazing": (-0.7, 0.68, 0.2),
+}
+"""Directions that sampling is tested for."""
+
+
+def _directed(name: str, n: int) -> F32:
+    w = np.float32(INCIDENT[name])
+    return np.tile(w / np.linalg.norm(w), (n, 1)).astype(np.float32)
+
+
+@pytest.mark.parametrize("incident", INCIDENT)
+@pytest.mark.parametrize("name", BSDFS)
+def test_samples_follow_the_density(name: str, incident: str, gallery: Gallery) -> None:
+    """H0: `bsdf_sample` draws from the density of `bsdf_eval_pdf`, and gives value ÷ density as weight.
+
+    χ² over 384 bins of the sphere, 200,000 samples, level 1e-4.
+    """
+    rng = np.random.default_rng(12)
+    n = 200_000
+    wi = _directed(incident, n)
+    uv = np.full((n, 2), (0.31, 0.62), np.float32)
+    bsdf = gallery.index[name]
+    wo, weight, pdf = gallery.core.bsdf_sample(bsdf, uv, wi, unit_interval(rng, n, 2))
+    drawn = pdf > 0
+
+    def density(w: F32) -> F32:
+        m = len(w)
+        return gallery.core.bsdf_eval_pdf(
+            bsdf, np.tile(uv[:1], (m, 1)), np.tile(wi[:1], (m, 1)), w
+        )[1]
+
+    p, text = sphere_chi2(wo[drawn], n, density)
+    assert p > 1e-4, text
+
+    value, again = gallery.core.bsdf_eval_pdf(bsdf, uv, wi, wo)
+    wrong = disagreements(pdf, again, rel=1e-3, floor=1e-4)
+    wrong |= disagreements(weight * pdf[:, None], value, rel=1e-3, floor=1e-4)
+    wrong &= drawn & (np.abs(wo[:, 2]) > 0.01)
+    assert not wrong.any(), first_rows(
+        wrong, wo=wo, pdf=pdf, again=again, weight=weight, value=value
+    )
+    np.testing.assert_allclose(np.linalg.norm(wo[drawn], axis=1), 1, atol=1e-5)
+    assert (weight[~drawn] == 0).all()
+
+
+@pytest.mark.parametrize("name", BSDFS)
+def test_samples_have_mitsubas_mean_weight(name: str, gallery: Gallery) -> None:
+    """H0: the same share of light is reflected, for 20,000 random (uv, wi), by both samplers; five standard errors."""
+    rng = np.random.default_rng(13)
+    n = 20_000
+    uv = rng.uniform(-1, 2, (n, 2)).astype(np.float32)
+    wi = sphere_directions(rng, n)
+    u = unit_interval(rng, n, 3)
+    _, ours, _ = gallery.core.bsdf_sample(gallery.index[name], uv, wi, u[:, :2].copy())
+    _, theirs = gallery.theirs[name].sample(
+        mi.BSDFContext(),
+        interaction(uv, wi),
+        mi.Float(u[:, 2].copy()),
+        mi.Point2f(u[:, :2].T.copy()),
+    )
+    difference = ours.astype(np.float64) - points(theirs)
+    se = difference.std(axis=0) / np.sqrt(n)
+    assert (np.abs(difference.mean(axis=0)) <= 5 * se + 1e-6).all(), (difference.mean(axis=0), se)
+
+
+@pytest.mark.parametrize("name", [*WHITE, *BSDFS])
+def test_no_bsdf_makes_energy(name: str, gallery: Gallery) -> None:
+    """White furnace: E[weight] ≤ 1 for every incident direction; four standard errors, and 1e-4 for rounding."""
+    rng = np.random.default_rng(14)
+    n = 50_000
+    for cos_theta in (1.0, 0.7, 0.3, 0.05):
+        wi = np.tile(np.float32([np.sqrt(1 - cos_theta**2), 0, cos_theta]), (n, 1))
+        uv = rng.random((n, 2)).astype(np.float32)
+        _, weight, _ = gallery.core.bsdf_sample(
+            gallery.index[name], uv, wi, unit_interval(rng, n, 2)
+        )
+        mean = weight.mean(axis=0, dtype=np.float64)
+        se = weight.std(axis=0, dtype=np.float64) / np.sqrt(n)
+        assert (mean <= 1 + 4 * se + 1e-4).all(), f"cos θ = {cos_theta}: {mean} ± {se}"

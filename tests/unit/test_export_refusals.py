@@ -1,0 +1,97 @@
+"""What cannot be exported is refused by name, in one line that says what is supported and what to do."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import pytest
+
+from pssflow.export import SUPPORTED, UnsupportedError, export, inspect_scene
+from tests.exports import Description, load
+
+
+def test_all_unsupported_things_are_collected_and_the_first_named(variant: str) -> None:
+    scene = load(
+        window={"type": "rectangle", "b": {"type": "dielectric"}},
+        bowl={"type": "sphere", "b": {"type": "dielectric", "int_ior": 1.3}},
+        floor={"type": "disk", "b": {"type": "diffuse", "reflectance": {"type": "checkerboard"}}},
+        sun={"type": "directional", "direction": [0, 0, -1]},
+        ground={"type": "cube", "b": {"type": "twosided", "b": {"type": "conductor"}}},
+    )
+    found = {(u.kind, u.plugin, u.shape) for u in inspect_scene(scene).unsupported}
+    assert found == {
+        ("BSDF", "dielectric", "window"),
+        ("BSDF", "dielectric", "bowl"),
+        ("texture", "checkerboard", "floor"),
+        ("emitter", "directional", None),
+        ("BSDF", "conductor", "ground"),
+    }
+    with pytest.raises(UnsupportedError) as caught:
+        export(scene)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert 'shape "bowl": BSDF "dielectric"' in message
+    assert "(and 1 more like it)" in message
+    assert 'shape "floor": texture "checkerboard"' in message
+    assert "and 1 more, listed by `pssflow info`" in message
+    assert f"BSDFs: {', '.join(SUPPORTED['BSDF'])}" in message
+    assert message.endswith("or render this scene with Mitsuba's `path`")
+
+
+REFUSED: dict[str, tuple[Description, str]] = {
+    "instance": (
+        {
+            "group": {"type": "shapegroup", "s": {"type": "sphere"}},
+            "copy": {"type": "instance", "g": {"type": "ref", "id": "group"}},
+        },
+        r'shape "copy": plugin "instance" is not supported \(supported shapes: .*sphere',
+    ),
+    "medium": (
+        {"fog": {"type": "sphere", "interior": {"type": "homogeneous"}}},
+        r'shape "fog": medium "homogeneous" is not supported\. Replace',
+    ),
+    "sensor": (
+        {"camera": {"type": "thinlens", "aperture_radius": 0.1, "focus_distance": 1.0}},
+        r'sensor "thinlens" \("camera"\) is not supported \(supported sensors: perspective\)',
+    ),
+    "spectrum": (
+        {"bulb": {"type": "point", "intensity": {"type": "blackbody", "temperature": 3000.0}}},
+        r'texture "blackbody" \("bulb.intensity"\) is not supported \(supported textures: bitmap',
+    ),
+    "spot": (
+        {"lamp": {"type": "spot"}},
+        r'^emitter "spot" \("lamp"\) is not supported \(supported emitters: area',
+    ),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_refusals_name_the_offender(scalar_variant: str, case: str) -> None:
+    parts, message = REFUSED[case]
+    with pytest.raises(UnsupportedError, match=message):
+        export(load(**parts))
+
+
+def test_a_scene_without_a_sensor_says_so(variant: str) -> None:
+    scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere"}})
+    with pytest.raises(ValueError, match="`sensor` = 0: the scene has none"):
+        export(scene)
+
+
+def test_what_is_no_scene_is_a_type_error(variant: str) -> None:
+    for thing in ("scene.xml", mi.load_dict({"type": "sphere"})):
+        with pytest.raises(TypeError, match=r"expected a `mi\.Scene`"):
+            export(thing)
+
+
+def test_other_variants_are_refused() -> None:
+    mi.set_variant("scalar_spectral")
+    scene = load(ball={"type": "sphere"})
+    with pytest.raises(UnsupportedError, match=r'"scalar_spectral" is not supported .*scalar_rgb'):
+        export(scene)
+    mi.set_variant("scalar_rgb")
+    scene = load(ball={"type": "sphere"})
+    mi.set_variant("llvm_ad_rgb")
+    with pytest.raises(
+        UnsupportedError, match=r'loaded in variant "scalar_rgb", but "llvm_ad_rgb"'
+    ):
+        export(scene)
