@@ -9,15 +9,19 @@ Any Python object with the methods of `ForeignGuide` works wherever a guide does
 ```python
 class Box:
     "Uniform on the box that holds all light seen so far: not the best of ideas, but a guide."
+
     def fit(self, u, f, g, zeros, seed):
         self.low, self.high = u.min(axis=0), u.max(axis=0)
+
     def sample(self, n, seed):
         u = np.random.default_rng(seed).uniform(self.low, self.high, (n, len(self.low)))
         u = u.astype(np.float32)
         return u, self.log_prob(u)
+
     def log_prob(self, u):
         inside = ((u >= self.low) & (u <= self.high)).all(axis=1)
         return np.where(inside, -np.log(self.high - self.low).sum(), -np.inf).astype(np.float32)
+
 
 pssflow.render("scene.xml", guide=Box())
 ```
@@ -266,11 +270,15 @@ def choose(guide: Any, options: Mapping[str, Any]) -> Choice:
         _no_options(options, "a guide that is fitted already")
         path = Path(guide)
         if not path.is_file():
-            raise FileNotFoundError(f"{path}: there is no such file (as a name, `guide` is one of {_known()})")
+            raise FileNotFoundError(
+                f"{path}: there is no such file (as a name, `guide` is one of {_known()})"
+            )
         return Choice(str(guide), "ready", learns=False, options={}, path=path)
     if isinstance(guide, str):
         return _named(guide, options)
-    missing = [name for name in ("fit", "sample", "log_prob") if not callable(getattr(guide, name, None))]
+    missing = [
+        name for name in ("fit", "sample", "log_prob") if not callable(getattr(guide, name, None))
+    ]
     if missing:
         raise TypeError(
             f"`guide` is a {type(guide).__name__} without `{'`, `'.join(missing)}`; expected a name ({_known()}), "
@@ -290,7 +298,9 @@ def options_json(options: Mapping[str, Any]) -> str:
         try:
             json.dumps(value, allow_nan=False)
         except (TypeError, ValueError):
-            raise ValueError(f"`{name}` = {value!r} is no option's value: no number, text, list or bool") from None
+            raise ValueError(
+                f"`{name}` = {value!r} is no option's value: no number, text, list or bool"
+            ) from None
     return json.dumps(dict(options))
 
 
@@ -302,7 +312,9 @@ def _named(guide: str, options: Mapping[str, Any]) -> Choice:
     parts = guide.split("+")
     for part in parts:
         if part not in known:
-            raise ValueError(f"`guide` = {guide!r} is unknown (known: {_known()}; or the path of a saved guide)")
+            raise ValueError(
+                f"`guide` = {guide!r} is unknown (known: {_known()}; or the path of a saved guide)"
+            )
     options_json(options)
     by_part: dict[str, dict[str, Any]] = {part: {} for part in parts}
     for key, value in options.items():
@@ -329,7 +341,9 @@ def _known() -> str:
 
 def _no_options(options: Mapping[str, Any], what: str) -> None:
     if options:
-        raise ValueError(f"`{next(iter(options))}` was given, but `guide` is {what} and takes no options")
+        raise ValueError(
+            f"`{next(iter(options))}` was given, but `guide` is {what} and takes no options"
+        )
 
 
 def _rows(u: ArrayLike) -> F32:

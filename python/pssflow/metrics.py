@@ -82,7 +82,7 @@ def relmse_trimmed(
     *,
     fraction: float = TRIMMED,
 ) -> float:
-    """relMSE without the `fraction` of pixels where it is largest: at least one is left out, and at least one left.
+    """RelMSE without the `fraction` of pixels where it is largest: at least one is left out, and at least one left.
 
     Raises:
         ValueError: as `relmse`, or `fraction` lies outside [0, 1).
@@ -95,7 +95,7 @@ def relmse_trimmed(
 def relmse_with_error(
     image: ArrayLike, reference: ArrayLike, reference_variance: ArrayLike | None = None
 ) -> Estimate:
-    """relMSE of one image and its standard error, from the spread between pixels.
+    """RelMSE of one image and its standard error, from the spread between pixels.
 
     That holds as far as pixels are independent: wide reconstruction filters correlate neighbours, so that the error is
     too small by up to the filter's area in pixels under a root. With several seeds use `mean_and_error`.

@@ -157,7 +157,7 @@ def choose_windows(errors: Sequence[Array], count: int = len(FRAMES)) -> list[Wi
     return windows
 
 
-def relative_error(image: Array, reference: Array, epsilon: float) -> Array:
+def error_map(image: Array, reference: Array, epsilon: float) -> Array:
     """(x−r)²/(r²+ε), mean over channels, (h, w): the terms of relMSE."""
     return np.mean((image - reference) ** 2 / (reference**2 + epsilon), axis=-1)
 

@@ -48,3 +48,358 @@ LEAST_PASSES = 4
 
 SAVE_EVERY = 30.0
 """Seconds between two writes of the cache while rendering."""
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A truth and how well it is known."""
+
+    image: F32
+    """Radiance (H, W, 3), W·sr⁻¹·m⁻². Noise may make it slightly negative."""
+    variance: F32
+    """Variance of each mean, (H, W, 3); zero where it is unknown (an image from elsewhere)."""
+    passes: int
+    """Independent images that it is the mean of."""
+    spp: int
+    """Samples per pixel in all, of each of the two depths."""
+    seconds: float
+    """That rendering took, earlier calls included."""
+    note: str
+    """Why it ended, or where it comes from; one line."""
+    k: int | None = None
+    """Bounces; None if unknown."""
+    path: Path | None = None
+    """The file that it is kept in."""
+    reached: bool = True
+    """Whether the standard error that was asked for was reached; True where none was."""
+
+    @property
+    def standard_error(self) -> float:
+        """Relative standard error: the root of the mean of variance/(r² + ε), comparable with √relMSE."""
+        return metrics.relative_error(self.variance, self.image)
+
+    def describe(self) -> dict[str, Any]:
+        """What a JSON record says about it."""
+        return {
+            "k": self.k,
+            "passes": self.passes,
+            "spp": self.spp,
+            "seconds": self.seconds,
+            "standard_error": metrics.finite_or_none(self.standard_error),
+            "reached": self.reached,
+            "mean": [float(c) for c in self.image.mean(axis=(0, 1), dtype=np.float64)],
+            "note": self.note,
+            "path": None if self.path is None else str(self.path),
+        }
+
+    def write(self, path: str | Path) -> None:
+        """Writes an EXR, the variance as layer `variance`; `read_exr` reads it.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        from . import _core
+
+        _core.write_exr(str(path), {"": self.image, "variance": self.variance})
+
+
+def reference(
+    scene: SceneLike,
+    k: int = 2,
+    *,
+    sensor: Any = 0,
+    seconds: float | None = 60.0,
+    target_se: float | None = None,
+    seed0: int = 0,
+    progress: Progress = True,
+    cache: str | Path | bool | None = None,
+) -> Reference:
+    """Renders Mitsuba's truth for light of exactly k bounces, or adds what is missing to a cached one.
+
+    Ends as soon as the relative standard error is at most `target_se`, or `seconds` were spent in all, cached passes
+    included: a second call with the same arguments renders nothing.
+
+    Args:
+        scene: as in `pssflow.render`; an `mi.Scene` and a `Scene` in their current state.
+        k: bounces, 1 … 32.
+        sensor: index of the sensor, or a sensor object; a `Scene` has its own.
+        seconds: None for as long as `target_se` needs.
+        target_se: relative standard error to reach, comparable with √relMSE; None to use up `seconds`.
+        seed0: seed of the first pass.
+        progress: as in `pssflow.render`; the phase is "reference".
+        cache: a folder; None for `default_cache()`, False for none. Files are named by scene, k, size and crop.
+
+    Raises:
+        UnsupportedError, FileNotFoundError: as `pssflow.render`.
+        ValueError: an argument is wrong.
+        OSError: `cache` cannot be written; this is found out before rendering.
+        KeyboardInterrupt: on Ctrl-C, after the running pass (below a second); finished passes are kept in the cache.
+    """
+    k = check_integer("k", k, 1, MAX_BOUNCES)
+    seed0 = check_integer("seed0", seed0, 0, 2**31 - 1)
+    if seconds is None and target_se is None:
+        raise ValueError("`seconds` and `target_se` are both None; the reference would never end")
+    limit = math.inf if seconds is None else check_number("seconds", seconds, 0.0, 1e9)
+    target = (
+        0.0 if target_se is None else check_number("target_se", target_se, 0.0, 1e9, above=True)
+    )
+
+    notices: list[str] = []
+    mi_scene, name = load_scene(scene, notices)
+    camera = scene.sensor if isinstance(scene, Scene) else sensor
+    # Anew even for a `Scene`: it may have been edited since, and the cache must not mix two states.
+    exported = export(mi_scene, camera)
+    path = _writable_cache(cache, notices, exported, k, seed0)
+    total = _load(path, notices) if path is not None else None
+    reused = 0 if total is None else total.passes
+    film = exported.description["film"]["crop_size"]
+    renderer = _Renderer(mi_scene, camera, k)
+    if total is None:
+        total = _Running.empty(film, max(PATHS_PER_PASS // (film[0] * film[1]), 1))
+
+    with reporting(progress) as listener:
+        try:
+            _accumulate(total, renderer, seed0, limit, target, listener, lambda: _save(path, total))
+        finally:
+            renderer.restore()
+            if total.passes > reused:
+                _save(path, total)
+    if total.non_finite:
+        notices.append(f"{total.non_finite} values that were not finite count as zero")
+    reached = target_se is None or total.standard_error() <= target
+    ending = _ending(total, limit, target_se, reached)
+    origin = f", {reused} of {total.passes} passes from the cache" if reused else ""
+    return Reference(
+        image=total.mean.astype(np.float32),
+        variance=total.variance().astype(np.float32),
+        passes=total.passes,
+        spp=total.spp,
+        seconds=total.seconds,
+        note="; ".join([f"Mitsuba path, {mi_scene.variant_name()}, {ending}{origin}", *notices]),
+        k=k,
+        path=path,
+        reached=reached,
+    )
+
+
+def read_exr(path: str | Path) -> Reference:
+    """Reads an image as a truth: its R, G, B, and the layer `variance` where it has one.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is no image, or holds values that are not finite.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: there is no such file")
+    try:
+        layers = dict(mi.Bitmap(str(path)).split())
+    except RuntimeError as error:
+        raise ValueError(f"{path}: cannot be read as an image: {first_line(error)}") from None
+    root = layers.get("<root>") or next(iter(layers.values()))
+    image = _rgb(root)
+    variance = _rgb(layers["variance"]) if "variance" in layers else np.zeros_like(image)
+    for what, values in (("image", image), ("variance", variance)):
+        bad = values.size - int(np.count_nonzero(np.isfinite(values)))
+        if bad:
+            raise ValueError(f"{path}: {bad} values of its {what} are not finite")
+    note = f"read from {path}" + ("" if "variance" in layers else ", its own noise unknown")
+    return Reference(image, variance, passes=1, spp=0, seconds=0.0, note=note, path=path)
+
+
+def default_cache() -> Path:
+    """`$XDG_CACHE_HOME/pssflow/references`, or the same under `~/.cache`."""
+    base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    return Path(base).expanduser() / "pssflow" / "references"
+
+
+def cache_path(folder: str | Path, exported: Export, k: int, seed0: int = 0) -> Path:
+    """Where the truth of an exported scene is kept: the name holds a hash of all that it depends on."""
+    digest = hashlib.sha256()
+    digest.update(json.dumps([FORMAT, mi.__version__, k, seed0]).encode())
+    digest.update(exported.json().encode())
+    for array in exported.arrays:
+        digest.update(str((array.dtype.str, array.shape)).encode())
+        digest.update(np.ascontiguousarray(array).data)
+    film = exported.description["film"]
+    (width, height), (x, y) = film["crop_size"], film["crop_offset"]
+    return Path(folder) / f"{digest.hexdigest()[:20]}-k{k}-{width}x{height}+{x}+{y}.npz"
+
+
+@dataclass
+class _Running:
+    """Mean and sum of squared deviations over passes (Welford 1962), (H, W, 3) in double precision."""
+
+    mean: F64
+    m2: F64
+    passes: int
+    spp_per_pass: int
+    seconds: float
+    spp: int
+    non_finite: int
+
+    @classmethod
+    def empty(cls, size: list[int], spp_per_pass: int) -> _Running:
+        shape = (size[1], size[0], 3)
+        return cls(np.zeros(shape), np.zeros(shape), 0, spp_per_pass, 0.0, 0, 0)
+
+    def add(self, image: F64) -> None:
+        self.passes += 1
+        delta = image - self.mean
+        self.mean += delta / self.passes
+        self.m2 += delta * (image - self.mean)
+
+    def variance(self) -> F64:
+        """Of the mean."""
+        return self.m2 / max((self.passes - 1) * self.passes, 1)
+
+    def standard_error(self) -> float:
+        return metrics.relative_error(self.variance(), self.mean)
+
+
+class _Renderer:
+    """One pass: the difference of two path integrators."""
+
+    def __init__(self, scene: Any, sensor: Any, k: int) -> None:
+        self.scene = scene
+        self.camera = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+        self.jit = not scene.variant_name().startswith("scalar")
+        self.deep, self.shallow = (
+            mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": k + 2})
+            for depth in (k + 1, k)
+        )
+        self.sample_count = self.camera.sampler().sample_count()
+
+    def __call__(self, seed: int, spp: int) -> tuple[F64, int, int]:
+        """The image (H, W, 3), samples that the sampler made of `spp`, and values that were not finite."""
+        # A scalar sampler's streams part ways at the last bounce, so that one seed for both would buy nothing.
+        seeds = (seed, seed) if self.jit else (2 * seed, 2 * seed + 1)
+        with dr.suspend_grad():
+            deep = self._image(self.deep, seeds[0], spp)
+            shallow = self._image(self.shallow, seeds[1], spp)
+        image = deep - shallow
+        bad = ~np.isfinite(image)
+        image[bad] = 0.0
+        return image, self.camera.sampler().sample_count(), int(np.count_nonzero(bad))
+
+    def restore(self) -> None:
+        """Gives the sampler its own count back: rendering with another one changes it."""
+        self.camera.sampler().set_sample_count(self.sample_count)
+
+    def _image(self, integrator: Any, seed: int, spp: int) -> F64:
+        integrator.render(
+            self.scene, sensor=self.camera, seed=seed, spp=spp, develop=False, evaluate=True
+        )
+        # Raw, R G B (A) W: the same for each pixel format of the film.
+        raw = np.array(self.camera.film().develop(raw=True), np.float64)
+        weight = raw[..., -1:]
+        return raw[..., :3] / np.where(weight == 0.0, 1.0, weight)
+
+
+def _accumulate(
+    total: _Running,
+    renderer: Callable[[int, int], tuple[F64, int, int]],
+    seed0: int,
+    limit: float,
+    target: float,
+    listener: Callable[[str, float], None] | None,
+    save: Callable[[], None],
+) -> None:
+    """Adds passes until the error or the time is reached."""
+    saved, check = time.monotonic(), total.passes
+    while True:
+        if total.passes >= max(check, LEAST_PASSES):
+            error = total.standard_error()
+            if error <= target or total.seconds >= limit:
+                return
+            if listener is not None:
+                listener("reference", max(total.seconds / limit, min((target / error) ** 2, 1.0)))
+            # The error falls with the root of the passes: looking at every one would cost more than it saves.
+            check = total.passes + 1 if total.seconds >= limit else _next_check(total, limit)
+        if time.monotonic() - saved > SAVE_EVERY:
+            save()
+            saved = time.monotonic()
+        start = time.perf_counter()
+        image, spp, bad = renderer(seed0 + total.passes, total.spp_per_pass)
+        total.add(image)
+        total.spp += spp
+        total.non_finite += bad
+        total.seconds += time.perf_counter() - start
+
+
+def _next_check(total: _Running, limit: float) -> int:
+    """The pass after which to look again: 5 % more passes, but not past the end of the time."""
+    each = max(total.seconds / total.passes, 1e-9)
+    in_time = (
+        limit if math.isinf(limit) else total.passes + math.ceil((limit - total.seconds) / each)
+    )
+    return max(total.passes + 1, int(min(math.ceil(total.passes * 1.05), in_time)))
+
+
+def _ending(total: _Running, limit: float, target_se: float | None, reached: bool) -> str:
+    error = f"relative standard error {total.standard_error():.2g}"
+    if target_se is None:
+        return f"{total.seconds:.1f} s, {error}"
+    if reached:
+        return f"{error} ≤ {target_se:.2g} after {total.seconds:.1f} s"
+    return f"out of time after {limit:g} s: {error}, {target_se:.2g} was asked for"
+
+
+def _writable_cache(
+    cache: str | Path | bool | None, notices: list[str], exported: Export, k: int, seed0: int
+) -> Path | None:
+    """The file to use, its folder made; None without a cache. A default that cannot be written is no error."""
+    if cache is False:
+        return None
+    default = cache is None or cache is True
+    folder = default_cache() if default else Path(cache)
+    path = cache_path(folder, exported, k, seed0)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_beside(path.with_suffix(".probe"), lambda part: part.touch())
+        path.with_suffix(".probe").unlink()
+    except OSError as error:
+        if default:
+            notices.append(f"not cached: {first_line(error)}")
+            return None
+        raise OSError(f"{folder}: references cannot be kept there: {first_line(error)}") from None
+    return path
+
+
+def _load(path: Path, notices: list[str]) -> _Running | None:
+    """The cached state; None, with a notice where there is a file, if it cannot be used."""
+    if not path.exists():
+        return None
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            if int(stored["format"]) != FORMAT:
+                return None
+            return _Running(
+                mean=stored["mean"],
+                m2=stored["m2"],
+                passes=int(stored["passes"]),
+                spp_per_pass=int(stored["spp_per_pass"]),
+                seconds=float(stored["seconds"]),
+                spp=int(stored["spp"]),
+                non_finite=int(stored["non_finite"]),
+            )
+    except Exception as error:  # whatever a damaged archive raises, the remedy is the same
+        notices.append(f"{path} was damaged and is rendered anew ({first_line(error)})")
+        return None
+
+
+def _save(path: Path | None, total: _Running) -> None:
+    if path is None:
+        return
+
+    def write(part: Path) -> None:
+        with part.open("wb") as file:
+            np.savez(file, format=FORMAT, **vars(total))
+
+    write_beside(path, write)
+
+
+def _rgb(bitmap: Any) -> F32:
+    return np.array(
+        bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False), np.float32
+    )

@@ -126,7 +126,9 @@ def render(
         KeyboardInterrupt: on Ctrl-C, within a second.
 
     Examples:
-        >>> result = pssflow.render("scenes/cornell-box/scene.xml", "realnvp", spp=64, k=2)  # doctest: +SKIP
+        >>> result = pssflow.render(
+        ...     "scenes/cornell-box/scene.xml", "realnvp", spp=64, k=2
+        ... )  # doctest: +SKIP
         >>> result.write("cornell-box.exr")  # doctest: +SKIP
     """
     settings: dict[str, Any] = {
@@ -156,7 +158,9 @@ def render(
     if not isinstance(scene, Scene):
         scene = Scene(scene, sensor, threads=threads)
     elif sensor != 0 and sensor is not scene.sensor and sensor != scene.sensor:
-        raise ValueError("`sensor` was given beside a `Scene`, which has its own; make another `Scene`")
+        raise ValueError(
+            "`sensor` was given beside a `Scene`, which has its own; make another `Scene`"
+        )
     return run(scene, choice, plan, progress)
 
 

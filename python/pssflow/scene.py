@@ -99,7 +99,7 @@ class Pilot(Trace):
 
         def write(part: Path) -> None:
             with part.open("wb") as file:
-                np.savez_compressed(file, allow_pickle=False, **values)
+                np.savez(file, **values)
 
         write_beside(path, write)
 
@@ -116,10 +116,8 @@ class Pilot(Trace):
                 values: dict[str, Any] = {item.name: stored[item.name] for item in fields(cls)}
         except FileNotFoundError:
             raise FileNotFoundError(f"{path}: there is no such file") from None
-        except (KeyError, ValueError, OSError, EOFError) as error:
+        except Exception as error:  # what a damaged archive raises has no common base
             raise ValueError(f"{path}: is no pilot saved by pssflow: {first_line(error)}") from None
-        except Exception as error:  # zipfile.BadZipFile and zlib.error have no common base
-            raise ValueError(f"{path}: is damaged: {first_line(error)}") from None
         values["columns"] = values["columns"].tolist()
         values["learned"] = int(values["learned"])
         values["columns_hash"] = str(values["columns_hash"])
@@ -319,7 +317,9 @@ def load_scene(scene: SceneLike, notes: list[str], **xml_parameters: Any) -> tup
     if isinstance(scene, (str, Path)):
         path = Path(scene)
         if not path.is_file():
-            what = "is a folder; name the XML file in it" if path.is_dir() else "there is no such file"
+            what = (
+                "is a folder; name the XML file in it" if path.is_dir() else "there is no such file"
+            )
             raise FileNotFoundError(f"{path}: {what}")
         _note(notes, ensure_variant())
         try:
@@ -347,9 +347,7 @@ def load_scene(scene: SceneLike, notes: list[str], **xml_parameters: Any) -> tup
     return scene, scene.id() or "mi.Scene"
 
 
-def resize_film(
-    scene: Any, sensor: Any, size: tuple[int, int] | None, scale: float | None
-) -> None:
+def resize_film(scene: Any, sensor: Any, size: tuple[int, int] | None, scale: float | None) -> None:
     """Gives a sensor's film another size; see `Scene`.
 
     Raises:
@@ -378,7 +376,9 @@ def resize_film(
     else:
         return
     if new.max() > MOST_PIXELS:
-        raise ValueError(f"the film would have {new[0]}×{new[1]} pixels; at most {MOST_PIXELS} a side")
+        raise ValueError(
+            f"the film would have {new[0]}×{new[1]} pixels; at most {MOST_PIXELS} a side"
+        )
     parameters = mi.traverse(camera)
     for name, value in (("size", new), ("crop_size", crop), ("crop_offset", offset)):
         parameters[f"film.{name}"] = [int(n) for n in value]
@@ -423,5 +423,7 @@ def _one_scene(loaded: Any, name: str) -> Any:
 def _matrix(values: ArrayLike, name: str) -> F32:
     array = np.ascontiguousarray(values, np.float32)
     if array.ndim != 2:
-        raise ValueError(f"`{name}` has shape {array.shape}; expected two axes, a row for each path")
+        raise ValueError(
+            f"`{name}` has shape {array.shape}; expected two axes, a row for each path"
+        )
     return array

@@ -38,5 +38,7 @@ def llvm_problem() -> str | None:
     version = dr.detail.llvm_version()  # pyright: ignore[reportAttributeAccessIssue]
     if version[0] < OLDEST_LLVM:
         found = ".".join(str(n) for n in version)
-        return f"libLLVM {found} is too old for Dr.Jit: install libllvm19, or set DRJIT_LIBLLVM_PATH"
+        return (
+            f"libLLVM {found} is too old for Dr.Jit: install libllvm19, or set DRJIT_LIBLLVM_PATH"
+        )
     return None

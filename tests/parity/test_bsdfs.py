@@ -177,8 +177,10 @@ def test_value_and_density_are_mitsubas(name: str, gallery: Gallery) -> None:
     value, pdf = gallery.core.bsdf_eval_pdf(gallery.index[name], uv, wi, wo)
 
     si = interaction(uv, wi)
-    their_value, their_pdf = gallery.theirs[name].eval_pdf(mi.BSDFContext(), si, vector3(wo))
-    their_value, their_pdf = points(their_value), points(their_pdf)
+    # Not its `eval_pdf`: that of `roughplastic` gives a density below the horizon, which its `pdf` does not.
+    theirs, context = gallery.theirs[name], mi.BSDFContext()
+    their_value = points(theirs.eval(context, si, vector3(wo)))
+    their_pdf = points(theirs.pdf(context, si, vector3(wo)))
     assert np.count_nonzero(their_pdf) > n / 5
 
     wrong = disagreements(value, their_value, rel=1e-3, floor=1e-6)

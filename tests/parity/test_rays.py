@@ -31,7 +31,7 @@ RAYS = 20_000
 def _shapes() -> dict[str, Any]:
     """Every shape, turned, stretched, mirrored and inside out, without a single light."""
     T = mi.ScalarTransform4f
-    turn = T().rotate([1, 2, 0.5], 70)
+    turn = T().rotate([2 / 3, 1 / 3, 2 / 3], 70)
     grid = (T().translate([x, y, z]) for x in (-3, 0, 3) for y in (-3, 0, 3) for z in (-3, 0, 3))
     teapot = str(ROOT / "scenes" / "teapot" / "meshes" / "teapot.ply")
     shapes = {

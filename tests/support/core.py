@@ -31,7 +31,9 @@ def render(scene: _core.Scene, **options: Any) -> dict[str, Any]:
         "k": 2,
         "parametrisation": "bsdf",
         "emitter_strategy": "mis",
+        "keep_pilot": True,
         "seed": 0,
+        "threads": 0,
     }
     result = scene.render(json.dumps(defaults | options))
     return result | {"record": json.loads(result["record"])}

@@ -209,7 +209,7 @@ mod tests {
         let g = [1.0, 1.0, 0.5];
         let rows = records(&u, &f, &g).usable(1.0).unwrap().resample(90_000, 4);
         // Weights 1 : 2 : 6; binomial counts within five standard errors.
-        for (row, share) in [1.0 / 9.0, 2.0 / 9.0, 6.0 / 9.0].into_iter().enumerate() {
+        for (row, share) in [1.0f64 / 9.0, 2.0 / 9.0, 6.0 / 9.0].into_iter().enumerate() {
             let count = rows.iter().filter(|&&r| r == row).count() as f64;
             let se = (90_000.0 * share * (1.0 - share)).sqrt();
             assert!(

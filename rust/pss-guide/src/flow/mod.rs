@@ -7,6 +7,8 @@
 //!
 //! - `realnvp`: u = x. The base is normal on R^d, the cube is not: part of the samples falls outside.
 //! - `realnvp-logit`: u = sigmoid(x), every sample lands inside; ln q(u) = ln q(x) − Σ ln(u (1 − u)).
+//!   Where f32 has no number left (x > 17.3 rounds to u = 1, x < −87 to 0) the sample counts as outside
+//!   after all: moved to the last number, it would carry mass that the density there does not have.
 //!
 //! Base numbers come from the caller's uniform ones, z = Φ⁻¹(u + 2⁻²⁵): the middle of a 24-bit step, so
 //! that 0 is no special case. Start reading at [`RealNvp`]; networks are evaluated by `kernel`, trained by
@@ -44,6 +46,9 @@ const BELOW_ONE: f32 = 1.0 - f32::EPSILON / 2.0;
 
 /// Half a step of a 24-bit uniform number: where the density of u = 0 is evaluated.
 const HALF_STEP: f32 = 1.0 / 33_554_432.0;
+
+/// A number outside the cube.
+const OUTSIDE: f32 = -1.0;
 
 /// Where x lives.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -235,23 +240,25 @@ impl RealNvp {
         for (row, ((u, q), prior)) in u.chunks_exact_mut(d).zip(&mut *q).zip(prior).enumerate() {
             let mut log_q = prior - f64::from(*q);
             if self.domain == Domain::Logit {
-                let mut moved = false;
+                let (mut moved, mut inside) = (false, true);
                 for x in u.iter_mut() {
                     let y = f64::from(*x);
                     *x = sigmoid(y);
                     let (rounded, ln) = logit(*x);
                     log_q += ln;
                     moved |= (rounded - y).abs() > 4e-6;
+                    inside &= (0.0..1.0).contains(x);
                 }
-                // Near 1 the steps of f32 are wide: the density is then that of the number handed out.
-                if moved {
+                if !inside {
+                    log_q = f64::NEG_INFINITY;
+                } else if moved {
+                    // Near 1 the steps of f32 are wide: the density is then that of the number given.
                     again.push(row);
                 }
             }
             *q = to_density(log_q);
-            if !log_q.is_finite() && u.iter().any(|u| u.is_nan()) {
-                u.fill(-1.0); // Overflow inside the flow counts as outside the cube.
-                *q = 0.0;
+            if u.iter().any(|u| u.is_nan()) {
+                u.fill(OUTSIDE); // Overflow inside the flow counts as outside the cube.
             }
         }
         if !again.is_empty() {
@@ -287,7 +294,12 @@ impl RealNvp {
         }
         self.kernel.run(Direction::Normalise, &mut x, q);
         for (row, (z, q)) in x.chunks_exact(d).zip(&mut *q).enumerate() {
-            let outside = self.options.prior == Prior::Hypercube
+            let outside = match self.domain {
+                Domain::Logit => !u[row * d..(row + 1) * d]
+                    .iter()
+                    .all(|u| (0.0..1.0).contains(u)),
+                Domain::Cube => false,
+            } || self.options.prior == Prior::Hypercube
                 && !z.iter().all(|z| (0.0..=1.0).contains(z));
             let log_q = log_prior(self.options.prior, z) - f64::from(*q);
             *q = if outside {
@@ -299,9 +311,6 @@ impl RealNvp {
     }
 
     fn count_outside(&self) -> u32 {
-        if self.domain == Domain::Logit {
-            return 0;
-        }
         let d = self.dims();
         let stream = Stream::new(0, Purpose::Guide);
         let rows = 1024;
@@ -326,10 +335,11 @@ impl RealNvp {
     }
 }
 
-/// sigmoid(y) as a number of the cube, never 0 and never 1.
+/// sigmoid(y) in f32; 1 or [`OUTSIDE`] where no number of the open cube is near. NaN stays NaN.
 #[inline]
 fn sigmoid(y: f64) -> f32 {
-    ((1.0 / (1.0 + (-y).exp())) as f32).clamp(f32::MIN_POSITIVE, BELOW_ONE)
+    let u = (1.0 / (1.0 + (-y).exp())) as f32;
+    if u < f32::MIN_POSITIVE { OUTSIDE } else { u }
 }
 
 /// exp, finite.

@@ -6,8 +6,9 @@ use serde_json::json;
 
 use super::kernel::{Direction, Kernel};
 use super::options::{Prior, RealNvpOptions};
+use super::twin::{self, Twin};
 use super::weights::{Shape, Weights};
-use super::{Domain, RealNvp, train, twin};
+use super::{Domain, RealNvp, train};
 use crate::{Decision, Guide};
 
 fn numbers(stream: u32) -> Sequence {
@@ -75,6 +76,7 @@ fn the_kernel_computes_the_formula_both_ways_and_inverts_itself() {
             json!({ "couplings": couplings, "hidden": hidden, "layers": layers, "s_max": 2.0 });
         let options = options(Domain::Cube, given);
         let weights = weights(dims, &options, 1.5);
+        let exact = Twin::from(&weights);
         let kernel = Kernel::new(&weights, options.s_max);
         let rows = 53;
         let z = normal(rows, dims, 1);
@@ -85,7 +87,7 @@ fn the_kernel_computes_the_formula_both_ways_and_inverts_itself() {
         for row in 0..rows {
             let at = row * dims..(row + 1) * dims;
             let close = |a: f32, b: f64| (f64::from(a) - b).abs() < 1e-4 * (1.0 + b.abs());
-            let (want, log_det) = twin::generate(&weights, options.s_max, &f64s(&z[at.clone()]));
+            let (want, log_det) = twin::generate(&exact, options.s_max, &f64s(&z[at.clone()]));
             assert!(
                 x[at.clone()].iter().zip(&want).all(|(&a, &b)| close(a, b)),
                 "{dims}-D: {:?} {want:?}",
@@ -96,7 +98,7 @@ fn the_kernel_computes_the_formula_both_ways_and_inverts_itself() {
                 "{dims}-D log-det: {} {log_det}",
                 det[row]
             );
-            let (_, log_det) = twin::normalise(&weights, options.s_max, &f64s(&x[at.clone()]));
+            let (_, log_det) = twin::normalise(&exact, options.s_max, &f64s(&x[at.clone()]));
             assert!(
                 close(det_back[row], log_det),
                 "{dims}-D inverse log-det: {} {log_det}",
@@ -115,17 +117,17 @@ fn the_log_determinant_is_that_of_the_jacobian() {
         let given = json!({ "couplings": couplings, "hidden": hidden, "layers": layers });
         let options = options(Domain::Logit, given);
         let weights = weights(dims, &options, 1.5);
+        let exact = Twin::from(&weights);
         for z in normal(10, dims, 2).chunks_exact(dims).map(f64s) {
-            let (x, log_det) = twin::generate(&weights, options.s_max, &z);
-            let numeric =
-                twin::log_det_numeric(|z| twin::generate(&weights, options.s_max, z).0, &z);
+            let (x, log_det) = twin::generate(&exact, options.s_max, &z);
+            let numeric = twin::log_det_numeric(|z| twin::generate(&exact, options.s_max, z).0, &z);
             // A kink of LeakyReLU within the step of 1e-6 would spoil a row; the fixed rows meet none.
             assert!(
                 (log_det - numeric).abs() < 1e-6 * (1.0 + numeric.abs()),
                 "{dims}-D: {log_det} {numeric}"
             );
             let inverse =
-                twin::log_det_numeric(|x| twin::normalise(&weights, options.s_max, x).0, &x);
+                twin::log_det_numeric(|x| twin::normalise(&exact, options.s_max, x).0, &x);
             assert!(
                 (log_det + inverse).abs() < 1e-6 * (1.0 + inverse.abs()),
                 "{dims}-D: {log_det} {inverse}"
@@ -160,43 +162,42 @@ fn gradients_are_those_of_the_f64_twin() {
         let weights = weights(3, &options, if prior == "hypercube" { 0.2 } else { 1.0 });
         let x: Vec<f32> = uniform(20, 3, 4).iter().map(|u| 0.3 + 0.4 * u).collect();
         let rows: Vec<u32> = (0..20).collect();
-        let mean = |weights: &Weights| -> f64 {
-            let row = |x: &[f32]| {
-                twin::log_density(weights, options.s_max, options.prior, &f64s(x)).max(-87.0)
-            };
-            -x.chunks_exact(3).map(row).sum::<f64>() / 20.0
+        let exact = Twin::from(&weights);
+        let mean = |twin: &Twin| -> f64 {
+            let row = |x: &[f32]| twin::log_density(twin, options.s_max, options.prior, &f64s(x));
+            -x.chunks_exact(3).map(|x| row(x).max(-87.0)).sum::<f64>() / 20.0
         };
         let (loss, gradients) = train::gradients(&options, &weights, &x, &rows).unwrap();
         assert!(
-            (loss - mean(&weights)).abs() < 1e-5,
+            (loss - mean(&exact)).abs() < 1e-5,
             "{loss} {}",
-            mean(&weights)
+            mean(&exact)
         );
         let mut seen = 0;
         for (tensor, gradient) in gradients.iter().enumerate() {
             for (i, &g) in gradient.iter().enumerate() {
-                let moved = |by: f32| {
-                    let mut weights = weights.clone();
-                    weights.tensors[tensor][i] += by;
-                    (mean(&weights), f64::from(weights.tensors[tensor][i]))
+                let moved = |by: f64| {
+                    let mut twin = exact.clone();
+                    twin.tensors[tensor][i] += by;
+                    mean(&twin)
                 };
-                let ((a, wa), (b, wb)) = (moved(1e-3), moved(-1e-3));
-                let numeric = (a - b) / (wa - wb);
-                // A step of 1e-3 meets a kink here and there, which moves the quotient by less than this.
+                let numeric = (moved(1e-6) - moved(-1e-6)) / 2e-6;
+                // f32 against f64; the fixed rows meet no kink of LeakyReLU within the step.
                 let error = (f64::from(g) - numeric).abs();
                 assert!(
-                    error < 2e-3 * (1.0 + numeric.abs()),
+                    error < 1e-5 * (1.0 + numeric.abs()),
                     "{prior} tensor {tensor}[{i}]: {g} {numeric}"
                 );
                 seen += usize::from(g != 0.0);
             }
         }
-        // The masked inputs (one or two of three) and outputs have none; the hidden layers all do.
-        assert!(
-            seen > weights.shape.parameters() * 2 / 3,
-            "{seen} of {}",
-            weights.shape.parameters()
-        );
+        // Of 522 parameters, masks silence 118; a flat prior does not see the last shifts either.
+        let live = if prior == "gaussian" {
+            404..=404
+        } else {
+            200..=403
+        };
+        assert!(live.contains(&seen), "{prior}: {seen} gradients are not 0");
     }
 }
 
@@ -236,14 +237,31 @@ fn the_reported_density_is_that_of_the_returned_numbers() {
         let (mut u, mut q, mut again) = (uniform(rows, 5, 6), vec![0.0; rows], vec![0.0; rows]);
         flow.sample(Decision::Path, &[], &mut u, &mut q);
         flow.density(Decision::Path, &[], &u, &mut again);
-        for (row, (a, b)) in q.iter().zip(&again).enumerate() {
+        for ((u, a), b) in u.chunks_exact(5).zip(&q).zip(&again) {
             assert!(
-                (a / b - 1.0).abs() < 1e-4,
-                "{domain:?} row {row}: {a} {b} at {:?}",
-                &u[row * 5..row * 5 + 5]
+                a == b || (a / b - 1.0).abs() < 1e-4,
+                "{domain:?}, gain {gain}: {a} {b} at {u:?}"
             );
         }
     }
+}
+
+#[test]
+fn a_sample_beyond_the_last_number_below_one_counts_as_outside() {
+    // A shift of +40 in the logit: nearly all of the mass lies where f32 has no number left.
+    let given = json!({ "couplings": 2, "hidden": 4, "layers": 1 });
+    let options = options(Domain::Logit, given);
+    let mut weights = weights(1, &options, 0.0);
+    weights.tensors[7][1] = 40.0;
+    let mut flow = RealNvp::new(Domain::Logit, options, weights);
+    let (mut u, mut q) = (uniform(500, 1, 8), vec![1.0; 500]);
+    flow.sample(Decision::Path, &[], &mut u, &mut q);
+    assert!(
+        u.iter().all(|&u| u == 1.0) && q.iter().all(|&q| q == 0.0),
+        "{u:?}"
+    );
+    flow.outside = flow.count_outside();
+    assert_eq!(flow.mass_outside(), 1.0);
 }
 
 #[test]
@@ -260,7 +278,7 @@ fn the_edges_of_the_cube_have_finite_densities() {
         (Domain::Logit, "gaussian"),
         (Domain::Logit, "hypercube"),
     ] {
-        let flow = flow(domain, 2, json!({ "prior": prior }), 1.5);
+        let flow = flow(domain, 2, json!({ "prior": prior }), 1.0);
         for a in edges {
             for b in edges {
                 let (mut u, mut q) = ([a, b], [f32::NAN]);

@@ -2,12 +2,29 @@
 
 use super::kernel::SLOPE;
 use super::options::Prior;
-use super::weights::{Weights, kept};
+use super::weights::{Shape, Weights, kept};
 use crate::normal::LN_SQRT_TAU;
 
+/// All parameters in f64; [`Weights`] has the layout.
+#[derive(Clone)]
+pub(super) struct Twin {
+    shape: Shape,
+    pub(super) tensors: Vec<Vec<f64>>,
+}
+
+impl From<&Weights> for Twin {
+    fn from(weights: &Weights) -> Self {
+        let f64s = |t: &Vec<f32>| t.iter().map(|&w| f64::from(w)).collect();
+        Self {
+            shape: weights.shape,
+            tensors: weights.tensors.iter().map(f64s).collect(),
+        }
+    }
+}
+
 /// A row of raw s or t: the network `which` (0: s, 1: t) of a coupling at `x`.
-fn network(weights: &Weights, coupling: usize, which: usize, x: &[f64]) -> Vec<f64> {
-    let shape = weights.shape;
+fn network(twin: &Twin, coupling: usize, which: usize, x: &[f64]) -> Vec<f64> {
+    let shape = twin.shape;
     let mut y: Vec<f64> = x
         .iter()
         .enumerate()
@@ -15,12 +32,13 @@ fn network(weights: &Weights, coupling: usize, which: usize, x: &[f64]) -> Vec<f
         .collect();
     for layer in 0..shape.linear() {
         let (inputs, outputs) = shape.widths(layer);
-        let (weight, bias) = weights.linear(coupling, layer);
-        let at = |i: usize, o: usize| f64::from(weight[(which * inputs + i) * outputs + o]);
+        let tensor = (coupling * shape.linear() + layer) * 2;
+        let (weight, bias) = (&twin.tensors[tensor], &twin.tensors[tensor + 1]);
+        let at = |i: usize, o: usize| weight[(which * inputs + i) * outputs + o];
         y = (0..outputs)
             .map(|o| {
                 let sum: f64 = y.iter().enumerate().map(|(i, y)| y * at(i, o)).sum();
-                let sum = sum + f64::from(bias[which * outputs + o]);
+                let sum = sum + bias[which * outputs + o];
                 if layer == shape.layers || sum > 0.0 {
                     sum
                 } else {
@@ -33,10 +51,10 @@ fn network(weights: &Weights, coupling: usize, which: usize, x: &[f64]) -> Vec<f
 }
 
 /// z → (x, Σ s).
-pub(super) fn generate(weights: &Weights, s_max: f64, z: &[f64]) -> (Vec<f64>, f64) {
+pub(super) fn generate(twin: &Twin, s_max: f64, z: &[f64]) -> (Vec<f64>, f64) {
     let (mut x, mut log_det) = (z.to_vec(), 0.0);
-    for coupling in 0..weights.shape.couplings {
-        let [raw, t] = [0, 1].map(|which| network(weights, coupling, which, &x));
+    for coupling in 0..twin.shape.couplings {
+        let [raw, t] = [0, 1].map(|which| network(twin, coupling, which, &x));
         for i in (0..x.len()).filter(|&i| !kept(coupling, i)) {
             let s = s_max * (raw[i] / s_max).tanh();
             x[i] = x[i] * s.exp() + t[i];
@@ -47,10 +65,10 @@ pub(super) fn generate(weights: &Weights, s_max: f64, z: &[f64]) -> (Vec<f64>, f
 }
 
 /// x → (z, Σ s).
-pub(super) fn normalise(weights: &Weights, s_max: f64, x: &[f64]) -> (Vec<f64>, f64) {
+pub(super) fn normalise(twin: &Twin, s_max: f64, x: &[f64]) -> (Vec<f64>, f64) {
     let (mut z, mut log_det) = (x.to_vec(), 0.0);
-    for coupling in (0..weights.shape.couplings).rev() {
-        let [raw, t] = [0, 1].map(|which| network(weights, coupling, which, &z));
+    for coupling in (0..twin.shape.couplings).rev() {
+        let [raw, t] = [0, 1].map(|which| network(twin, coupling, which, &z));
         for i in (0..z.len()).filter(|&i| !kept(coupling, i)) {
             let s = s_max * (raw[i] / s_max).tanh();
             z[i] = (z[i] - t[i]) * (-s).exp();
@@ -61,8 +79,8 @@ pub(super) fn normalise(weights: &Weights, s_max: f64, x: &[f64]) -> (Vec<f64>, 
 }
 
 /// ln q(x).
-pub(super) fn log_density(weights: &Weights, s_max: f64, prior: Prior, x: &[f64]) -> f64 {
-    let (z, log_det) = normalise(weights, s_max, x);
+pub(super) fn log_density(twin: &Twin, s_max: f64, prior: Prior, x: &[f64]) -> f64 {
+    let (z, log_det) = normalise(twin, s_max, x);
     let prior = match prior {
         Prior::Gaussian => z.iter().map(|z| -0.5 * z * z - LN_SQRT_TAU).sum(),
         Prior::Hypercube if z.iter().all(|z| (0.0..=1.0).contains(z)) => 0.0,

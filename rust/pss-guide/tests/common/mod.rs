@@ -1,33 +1,35 @@
 //! Data, fits and statistics that the tests share.
 #![allow(clippy::unwrap_used)]
 
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, OnceLock};
+
 use pss_guide::{Decision, Fit, Guide, Header, Records, fit};
 use pss_rng::{Purpose, Stream};
 use serde_json::{Map, Value};
 
 /// What the tests' files claim to be fitted for.
-#[allow(non_snake_case, reason = "stands for a constant")]
-pub fn HEADER() -> Header {
+pub(crate) fn header() -> Header {
     Header {
         columns_hash: "columns-1".to_owned(),
         scene_hash: "scene-1".to_owned(),
     }
 }
 
-pub fn options(list: &[(&str, Value)]) -> Map<String, Value> {
+pub(crate) fn options(list: &[(&str, Value)]) -> Map<String, Value> {
     list.iter()
         .map(|(name, value)| ((*name).to_owned(), value.clone()))
         .collect()
 }
 
 /// `n` rows of uniform numbers.
-pub fn uniform(n: usize, dims: usize, stream: u32) -> Vec<f32> {
+pub(crate) fn uniform(n: usize, dims: usize, stream: u32) -> Vec<f32> {
     let mut numbers = Stream::new(21, Purpose::Test).sequence(stream, dims as u32);
     (0..n * dims).map(|_| numbers.next_f32()).collect()
 }
 
 /// Records of two paths, for tests that never get to look at them.
-pub fn indent() -> Records<'static> {
+pub(crate) fn two_paths() -> Records<'static> {
     Records {
         dims: 1,
         u: &[0.25, 0.75],
@@ -42,12 +44,12 @@ pub fn indent() -> Records<'static> {
 /// A contribution with a known integral: Π over the columns of 30 u² (1 − u)² where the first column is
 /// below 3/4, and 0 beyond, as if something stood in the way there.
 #[derive(Clone, Copy)]
-pub struct Target {
-    pub dims: usize,
+pub(crate) struct Target {
+    pub(crate) dims: usize,
 }
 
 impl Target {
-    pub fn f(&self, u: &[f32]) -> f32 {
+    pub(crate) fn f(&self, u: &[f32]) -> f32 {
         if u[0] >= 0.75 {
             return 0.0;
         }
@@ -57,13 +59,13 @@ impl Target {
     }
 
     /// Each column's integral is 1; the first one's ends at x = 3/4: 10x³ − 15x⁴ + 6x⁵.
-    pub fn integral(&self) -> f64 {
+    pub(crate) fn integral(&self) -> f64 {
         let x = 0.75f64;
         10.0 * x.powi(3) - 15.0 * x.powi(4) + 6.0 * x.powi(5)
     }
 
     /// Uniform paths and their contributions, zeros among them.
-    pub fn paths(&self, n: usize, stream: u32) -> (Vec<f32>, Vec<f32>) {
+    pub(crate) fn paths(&self, n: usize, stream: u32) -> (Vec<f32>, Vec<f32>) {
         let u = uniform(n, self.dims, 100 + stream);
         let f = u.chunks_exact(self.dims).map(|u| self.f(u)).collect();
         (u, f)
@@ -71,7 +73,13 @@ impl Target {
 }
 
 /// A guide fitted to `n` uniform paths of [`Target`].
-pub fn fit_with(name: &str, dims: usize, n: usize, options: Map<String, Value>, seed: u64) -> Fit {
+pub(crate) fn fit_with(
+    name: &str,
+    dims: usize,
+    n: usize,
+    options: Map<String, Value>,
+    seed: u64,
+) -> Fit {
     let (u, f) = Target { dims }.paths(n, 0);
     let g = vec![1.0; n];
     let records = Records {
@@ -86,13 +94,22 @@ pub fn fit_with(name: &str, dims: usize, n: usize, options: Map<String, Value>, 
     fit(name, &options, &records, seed, &mut |_| true).unwrap()
 }
 
-/// The default fit of the tests.
-pub fn fit_small(name: &str, dims: usize) -> Fit {
-    fit_with(name, dims, 6000, Map::new(), 1)
+/// The default fit of the tests, made once in each process.
+pub(crate) fn fit_small(name: &'static str, dims: usize) -> Arc<Fit> {
+    type Made = Mutex<BTreeMap<(&'static str, usize), Arc<OnceLock<Arc<Fit>>>>>;
+    static MADE: Made = Mutex::new(BTreeMap::new());
+    let cell = MADE
+        .lock()
+        .unwrap()
+        .entry((name, dims))
+        .or_default()
+        .clone();
+    cell.get_or_init(|| Arc::new(fit_with(name, dims, 6000, Map::new(), 1)))
+        .clone()
 }
 
 /// Mean and its standard error.
-pub fn mean(values: impl Iterator<Item = f64>) -> (f64, f64) {
+pub(crate) fn mean(values: impl Iterator<Item = f64>) -> (f64, f64) {
     let (mut n, mut mean, mut square) = (0.0, 0.0, 0.0);
     for x in values {
         n += 1.0;
@@ -105,7 +122,7 @@ pub fn mean(values: impl Iterator<Item = f64>) -> (f64, f64) {
 
 /// p-value of Pearson's χ² over 16 × 16 cells and the outside, 200,000 samples against the integrated
 /// density; a share `wrong` of the samples is replaced by uniform numbers.
-pub fn chi_square(guide: &dyn Guide, wrong: f64) -> f64 {
+pub(crate) fn chi_square(guide: &dyn Guide, wrong: f64) -> f64 {
     const CELLS: usize = 16;
     const INNER: usize = 8;
     let n = 200_000;
@@ -174,7 +191,7 @@ fn chi_square_tail(x: f64, degrees: f64) -> f64 {
 }
 
 /// Two interleaved half circles of radius 1 with normal noise of 0.1, scaled into the cube.
-pub mod moons {
+pub(crate) mod moons {
     use pss_rng::{Purpose, Stream};
 
     const NOISE: f64 = 0.1;
@@ -192,7 +209,7 @@ pub mod moons {
     }
 
     /// `n` points.
-    pub fn points(n: usize, stream: u32) -> Vec<f32> {
+    pub(crate) fn points(n: usize, stream: u32) -> Vec<f32> {
         let mut numbers = Stream::new(31, Purpose::Test).sequence(stream, 0);
         let mut points = Vec::with_capacity(2 * n);
         while points.len() < 2 * n {
@@ -212,7 +229,7 @@ pub mod moons {
     }
 
     /// Mean ln of the true density, by quadrature along the arcs.
-    pub fn mean_log_density(points: &[f32]) -> f64 {
+    pub(crate) fn mean_log_density(points: &[f32]) -> f64 {
         const STEPS: usize = 400;
         let centres: Vec<[f64; 2]> = [true, false]
             .into_iter()
@@ -234,7 +251,7 @@ pub mod moons {
     }
 
     /// Mean ln density of the normal with the points' own moments.
-    pub fn normal_log_density(points: &[f32]) -> f64 {
+    pub(crate) fn normal_log_density(points: &[f32]) -> f64 {
         let m = [0, 1].map(|i| mean(points, |u| f64::from(u[i])));
         let c = |i: usize, j: usize| {
             mean(points, |u| {

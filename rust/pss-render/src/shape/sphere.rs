@@ -66,13 +66,25 @@ impl Sphere {
         Vec2::new(phi / TAU, theta / PI)
     }
 
+    /// Whether a point at this squared distance from the centre samples the cone (or else the area).
+    ///
+    /// Points on the sphere itself count as being on the side that it shines to. Sampling and density must
+    /// agree on this: Mitsuba's density decides by another rule, and its weights are off by up to 2 for light
+    /// that goes from a sphere to itself.
+    #[inline]
+    fn is_outside(&self, distance_2: f32) -> bool {
+        let limit = self.radius * (1.0 - self.sign * RAY_EPSILON);
+        distance_2 > limit * limit
+    }
+
     fn area_sample(&self, reference: Vec3, u: [f32; 2]) -> SurfaceSample {
         let d = square_to_uniform_sphere(u);
         let p = self.center + d * self.radius;
         SurfaceSample {
             p,
             n: d * self.sign,
-            uv: Vec2::ZERO,
+            // Mitsuba leaves it zero, since it draws textured lights by their texels; we draw all by surface.
+            uv: Self::uv(self.map.inverse_point(p)),
             pdf: solid_angle_pdf(1.0 / self.area(), p - reference, d),
         }
     }
@@ -116,8 +128,7 @@ impl ShapeModel for Sphere {
     fn sample_direction(&self, reference: Vec3, u: [f32; 2]) -> SurfaceSample {
         let to_center = self.center - reference;
         let distance_2 = to_center.length_squared();
-        let limit = self.radius * (1.0 - self.sign * RAY_EPSILON);
-        if distance_2 <= limit * limit {
+        if !self.is_outside(distance_2) {
             return self.area_sample(reference, u);
         }
         let inverse_distance = 1.0 / distance_2.sqrt();
@@ -143,15 +154,16 @@ impl ShapeModel for Sphere {
         SurfaceSample {
             p,
             n: d * self.sign,
-            uv: Vec2::ZERO,
+            uv: Self::uv(self.map.inverse_point(p)),
             pdf: if p == reference { 0.0 } else { uniform_cone_pdf(cos_max) },
         }
     }
 
     fn pdf_direction(&self, reference: Vec3, p: Vec3, n: Vec3) -> f32 {
-        let sin_alpha = self.radius / (self.center - reference).length();
-        if sin_alpha < 1.0 - f32::EPSILON / 2.0 {
-            uniform_cone_pdf(safe_sqrt(1.0 - sin_alpha * sin_alpha))
+        let distance_2 = (self.center - reference).length_squared();
+        if self.is_outside(distance_2) {
+            let sin_2 = self.radius * self.radius / distance_2;
+            uniform_cone_pdf(safe_sqrt(1.0 - sin_2))
         } else {
             solid_angle_pdf(1.0 / self.area(), p - reference, n)
         }

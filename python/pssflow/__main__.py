@@ -1,0 +1,8 @@
+"""`python -m pssflow` is the command `pssflow`."""
+
+import sys
+
+from .cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,223 @@
+r"""The integrator plugin.
+
+.. _integrator-pssflow:
+
+Learned light of exactly k bounces (:monosp:`pssflow`)
+------------------------------------------------------
+
+.. pluginparameters::
+
+ * - guide
+   - |string|
+   - What chooses the random numbers: ``none``, a guide's name (several joined by ``+``), or the path of a saved guide.
+     (Default: ``realnvp``)
+ * - k
+   - |int|
+   - Bounces between camera and light, 1 … 32. (Default: 2)
+ * - spp
+   - |int|
+   - Samples per pixel in all, pilot inside. (Default: the sampler's ``sample_count``; ``spp`` of ``mi.render`` wins)
+ * - time
+   - |float|
+   - Seconds in place of ``spp``, for pilot, fit and rendering. (Default: none; ``spp`` of ``mi.render`` wins)
+ * - parametrisation
+   - |string|
+   - ``bsdf``, ``cosine`` or ``uniform``: what a direction's two numbers mean. (Default: ``bsdf``)
+ * - emitter_strategy
+   - |string|
+   - ``mis``, ``nee`` or ``auto``. (Default: ``mis``)
+ * - uniform_fraction
+   - |float|
+   - Share of uniform paths in the mixture, in [0, 1]. (Default: the guide's, 0.25 for flows; bounds weights by 1/0.25)
+ * - pilot_spp
+   - |int|
+   - Samples per pixel of the pilot. (Default: a quarter of ``spp``, or a seventh of ``time``)
+ * - keep_pilot
+   - |bool|
+   - Whether the pilot's paths enter the image. (Default: |true|)
+ * - preset
+   - |string|
+   - ``thesis``: NEE alone, half of the samples for a pilot that is discarded, no uniform paths. (Default: none)
+ * - seed
+   - |int|
+   - Used where ``mi.render`` gets no seed, or 0. (Default: 0)
+ * - threads
+   - |int|
+   - Threads of the core, 0 for all cores. (Default: 0)
+ * - progress
+   - |bool|
+   - Bars on stderr, if that is a terminal. (Default: |false|)
+ * - <guide>_<option>
+   - |int|, |float|, |bool| or |string|
+   - An option of the guide, its name written with ``_``: ``realnvp_epochs``, ``realnvp_logit_hidden``. A dictionary's
+     keys cannot hold the dot of the command's ``--set realnvp.epochs=7``. Options of another guide are refused.
+
+Renders only light that was reflected exactly k times on its way from an emitter: no emitter is seen, and for k = 2 no
+direct light. The image is unbiased for every guide as long as ``uniform_fraction`` is positive, since each sample is
+divided by the mixture's density; the preset ``thesis`` has none and may be biased. A guide costs a pilot and training in
+every call of ``render``: expect no gain at few samples, nor in easy scenes, and compare with ``guide`` = ``none``.
+
+Paths are traced by pssflow's core on all cores, not by Mitsuba, in ``scalar_rgb`` and ``llvm_ad_rgb``; other variants know
+no such plugin. The scene is read anew in each call, edits through ``mi.traverse`` included, and may hold only what
+``pssflow info`` calls supported. Alpha is 1 everywhere. Nothing is differentiated: gradients raise an error. Attribute
+``result`` keeps the last ``pssflow.Result``: variance, statistics, the guide.
+
+.. tabs::
+    .. code-tab:: xml
+
+        <integrator type="pssflow">
+            <string name="guide" value="realnvp"/>
+            <integer name="k" value="2"/>
+            <integer name="realnvp_epochs" value="7"/>
+        </integrator>
+
+    .. code-tab:: python
+
+        'type': 'pssflow',
+        'guide': 'realnvp',
+        'k': 2,
+        'realnvp_epochs': 7
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from .. import guide as guides
+from ..options import DEFAULT_SPP, Plan
+from ..render import Result, run
+from ..scene import Scene
+
+__all__ = ["define"]
+
+PARAMETERS: tuple[str, ...] = (
+    "spp",
+    "time",
+    "k",
+    "parametrisation",
+    "emitter_strategy",
+    "uniform_fraction",
+    "pilot_spp",
+    "keep_pilot",
+    "preset",
+    "seed",
+)
+"""Those that mean what they mean in `pssflow.render`."""
+
+
+def define() -> Callable[[Any], Any]:
+    """The integrator of the active variant: a function from `mi.Properties` to an instance."""
+
+    class PssflowIntegrator(mi.SamplingIntegrator):
+        """See the module."""
+
+        def __init__(self, props: Any) -> None:
+            _without_warning(super().__init__, props)
+            guide = str(props.get("guide", "realnvp"))
+            self.choice = guides.choose(guide, _guide_options(props, guide))
+            given = {name: props.get(name) for name in PARAMETERS if name in props}
+            self.arguments: dict[str, Any] = given
+            self.arguments["threads"] = props.get("threads", 0) or None
+            self.progress = bool(props.get("progress", False))
+            self.result: Result | None = None
+            # Wrong values are found where the scene is loaded, not when it is rendered.
+            self._plan(spp=0, seed=0, sample_count=DEFAULT_SPP)
+
+        def render(
+            self,
+            scene: Any,
+            sensor: Any = 0,
+            seed: Any = 0,
+            spp: int = 0,
+            develop: bool = True,
+            evaluate: bool = True,
+        ) -> Any:
+            """Renders into the sensor's film; returns its developed image, or an empty tensor without `develop`."""
+            del evaluate  # The image is computed here and now in either case.
+            camera = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            plan = self._plan(
+                spp=int(spp),
+                seed=_scalar(seed),
+                sample_count=camera.sampler().sample_count(),
+            )
+            self.result = run(
+                Scene(scene, camera, threads=plan.threads or None), self.choice, plan, self.progress
+            )
+            _fill(camera.film(), self.result.image)
+            return camera.film().develop() if develop else mi.TensorXf()
+
+        def render_forward(self, *_args: Any, **_kwargs: Any) -> Any:
+            """Raises: there are no derivatives."""
+            raise NotImplementedError(NO_GRADIENTS)
+
+        def render_backward(self, *_args: Any, **_kwargs: Any) -> None:
+            """Raises: there are no derivatives."""
+            raise NotImplementedError(NO_GRADIENTS)
+
+        def aov_names(self) -> list[str]:
+            """None: the variance is in `result`."""
+            return []
+
+        def to_string(self) -> str:
+            """As Mitsuba prints its own."""
+            values = {"guide": self.choice.label, **self.arguments, **self.choice.options}
+            lines = [f"  {name} = {value}" for name, value in values.items() if value is not None]
+            return "PssflowIntegrator[\n" + ",\n".join(lines) + "\n]"
+
+        def _plan(self, *, spp: int, seed: int, sample_count: int) -> Plan:
+            """The arguments of one call: `mi.render`'s own win; there 0 says "not given"."""
+            arguments = dict(self.arguments)
+            if spp:
+                arguments["spp"] = spp
+                arguments.pop("time", None)
+            elif not {"spp", "time"} & arguments.keys() and "preset" not in arguments:
+                arguments["spp"] = sample_count
+            if seed:
+                arguments["seed"] = seed
+            return Plan.make(learns=self.choice.learns, **arguments)
+
+    return PssflowIntegrator
+
+
+NO_GRADIENTS = "integrator pssflow: it has no derivatives; differentiate with Mitsuba's `prb`"
+
+
+def _guide_options(props: Any, guide: str) -> dict[str, Any]:
+    """The options of the guides in use. Those of others are not read: Mitsuba lists them as unreferenced."""
+    options: dict[str, Any] = {}
+    known = guides.registry()
+    for part in guide.split("+"):
+        prefix = part.replace("-", "_") + "_"
+        for option in known.get(part, {}).get("options", ()):
+            if prefix + option in props:
+                options[f"{part}.{option}"] = props.get(prefix + option)
+    return options
+
+
+def _fill(film: Any, image: Any) -> None:
+    """Makes an image (H, W, 3) the film's content, so that it develops to its own pixel format."""
+    channels = film.prepare([])
+    # R G B W, or R G B A W; the image is filtered and divided by its weights already.
+    values = np.ones((*image.shape[:2], channels), np.float32)
+    values[..., :3] = image
+    block = mi.ImageBlock(mi.TensorXf(values), film.crop_offset(), border=False)
+    film.put_block(block)
+
+
+def _scalar(seed: Any) -> int:
+    """A seed, which JIT variants may pass as an array of one."""
+    return int(seed) if isinstance(seed, int) else int(np.asarray(seed).ravel()[0])
+
+
+def _without_warning(construct: Callable[[Any], None], props: Any) -> None:
+    """Keeps back Mitsuba's warning that integrators in Python are slow in scalar variants: this one runs in Rust."""
+    level = mi.log_level()
+    mi.set_log_level(mi.LogLevel.Error)
+    try:
+        construct(props)
+    finally:
+        mi.set_log_level(level)

@@ -1,0 +1,155 @@
+"""Runs in words and pictures: rich tables, and what stands above each image of a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from . import metrics
+from .picture import Panel, Picture, Row, error_map
+from .reference import Reference
+from .render import Result
+
+__all__ = [
+    "compare_picture",
+    "number",
+    "panel",
+    "percent",
+    "reference_panel",
+    "runs_table",
+    "scene_info",
+]
+
+PER_ROW = 4
+"""Runs side by side in a picture, beside the reference."""
+
+
+def runs_table(runs: Sequence[Mapping[str, Any]], title: str = "") -> Table:
+    """One row a run; columns that no run can fill are left out."""
+    shown = Table(title=title, title_justify="left", title_style="bold")
+    measured = any(run["relmse"] is not None for run in runs)
+    shown.add_column("guide")
+    shown.add_column("budget")
+    headings = ["a", "s", "camera rays", "found", "non-zero", "share"]
+    headings += ["relMSE", "trimmed", "gain"] if measured else ["rel. variance"]
+    headings += ["max 1/m", "max f/m ÷ mean"]
+    for heading in headings:
+        shown.add_column(heading, justify="right", overflow="fold")
+    for run in runs:
+        cells = [run["guide"], run["budget"]]
+        if run["chosen"] != run["guide"]:
+            cells[0] += f" → {run['chosen']}"
+        cells += [
+            number(run["a"], 3),
+            number(run["seconds"]["total"], 3),
+            count(run["camera_rays"]),
+            count(run["paths_found"]),
+            count(run["nonzero"]),
+            percent(run["nonzero_share"]),
+        ]
+        if measured:
+            cells += [number(run["relmse"]), number(run["relmse_trimmed"]), gain(run, runs)]
+        else:
+            cells.append(number(run["variance"]))
+        cells += [number(run["max_weight"], 3), number(run["max_contribution"], 3)]
+        shown.add_row(*cells)
+    return shown
+
+
+def gain(run: Mapping[str, Any], runs: Sequence[Mapping[str, Any]]) -> str:
+    """relMSE of the first run without a guide ÷ this run's; nothing where one of them is missing."""
+    plain = next((r for r in runs if r["guide"] == "none"), None)
+    if plain is None or plain is run or not plain["relmse"] or not run["relmse"]:
+        return "" if plain is None or plain is not run else "1"
+    return f"{plain['relmse'] / run['relmse']:.2f}"
+
+
+def compare_picture(
+    scene: str, runs: Sequence[Result], truth: Reference, caption: str
+) -> Picture:
+    """The reference and all runs, a few to a row."""
+    panels = [panel(run, truth, [other.stats for other in runs]) for run in runs]
+    rows = [Row(panels[i : i + PER_ROW]) for i in range(0, len(panels), PER_ROW)]
+    stats = runs[0].stats
+    bounces = "1 bounce" if stats["k"] == 1 else f"{stats['k']} bounces"
+    heading = f"{scene}: light of exactly {bounces} ({stats['parametrisation']}, {stats['emitter_strategy']})"
+    return Picture(heading, rows, reference_panel(truth), caption=caption)
+
+
+def panel(
+    run: Result, truth: Reference, runs: Sequence[Mapping[str, Any]] = (), title: str = ""
+) -> Panel:
+    """One run's image with its budget word for word, its errors and its shares."""
+    stats = run.stats
+    won = gain(stats, runs)
+    better = f", gain {won}" if won not in ("", "1") else ""
+    return Panel(
+        title=title or stats["guide"],
+        image=run.image,
+        lines=[
+            stats["budget"],
+            f"relMSE {number(stats['relmse'])} (trimmed {number(stats['relmse_trimmed'])}){better}",
+            f"non-zero {percent(stats['nonzero_share'])} of {count(stats['paths_found'])} paths found",
+        ],
+        error=error_map(run.image, truth.image, metrics.epsilon(truth.image)),
+    )
+
+
+def reference_panel(truth: Reference) -> Panel:
+    """The truth, and how well it is known."""
+    name = "Mitsuba’s path" if truth.k is not None else "reference"
+    lines = [f"depth {truth.k + 1} − depth {truth.k}"] if truth.k is not None else []
+    if truth.spp:
+        lines.append(f"{truth.spp:,} spp each, {truth.seconds:.0f} s".replace(",", " "))
+    if truth.variance.any():
+        lines.append(f"relative standard error {number(truth.standard_error, 2)}")
+    return Panel(name, np.maximum(truth.image, 0.0), lines)
+
+
+def scene_info(record: Mapping[str, Any]) -> list[Any]:
+    """What `pssflow info` prints: tables, and lines of text."""
+    found = Table(title=record["scene"], title_justify="left", title_style="bold")
+    found.add_column("kind")
+    found.add_column("understood")
+    for kind, plugins in record["counts"].items():
+        if plugins:
+            found.add_row(kind, ", ".join(f"{n} {name}" for name, n in plugins.items()))
+    found.add_row("triangles", count(record["triangles"]))
+    found.add_row("arrays", f"{record['array_bytes'] / 2**20:.1f} MiB")
+    guides = Table(title="guides", title_justify="left", title_style="bold")
+    guides.add_column("name")
+    guides.add_column("what it is; options and defaults for --set")
+    guides.add_row("none", "random numbers")
+    for name, guide in record["guides"].items():
+        options = ", ".join(
+            f"{key}={_option(value)}" for key, value in guide["options"].items()
+        )
+        guides.add_row(name, f"{guide['summary']}\n{options}")
+    refused = [f"not supported: {line}" for line in record["unsupported"]]
+    return [found, *(refused or ["Everything in it is supported."]), guides]
+
+
+def number(value: float | None, digits: int = 4) -> str:
+    """A few significant digits; a dash for what is unknown."""
+    if value is None:
+        return "–"
+    if value != 0 and not 1e-3 <= abs(value) < 1e5:
+        return f"{value:.{digits - 1}e}"
+    return f"{value:.{digits}g}"
+
+
+def count(value: int) -> str:
+    """Thousands apart."""
+    return f"{value:,}".replace(",", " ")
+
+
+def percent(share: float | None) -> str:
+    """A share with two digits, as the thesis' tables have them."""
+    return "–" if share is None else f"{100 * share:.2f} %"
+
+
+def _option(value: Any) -> str:
+    return "null" if value is None else str(value)
