@@ -1,7 +1,7 @@
 """Learned importance sampling in primary sample space for Mitsuba 3.
 
-pssflow renders the light that reaches the eye after exactly k reflections, from paths whose random numbers a *guide* has
-learned to choose. The scene is Mitsuba's; tracing and learning are a Rust core.
+pssflow renders the light that reaches the eye after exactly k reflections, from paths whose random numbers a *guide*
+has learned to choose. The scene is Mitsuba's; tracing and learning are a Rust core.
 
 | to …                                            | use                                                              |
 |-------------------------------------------------|------------------------------------------------------------------|

@@ -108,14 +108,14 @@ class Scene:
         {"guide": "none" | name of the registry | "ready" (the fitted `guide`) | "foreign" (the object `guide`),
          "guide_options": {...}, "k": 2, "parametrisation": "bsdf|cosine|uniform",
          "emitter_strategy": "mis|nee", "spp": N or null, "time": seconds or null,
-         "replay": [{"kind": "pilot|guided|uniform", "spp": n}, ...] or null,
+         "replay": [{"kind": "pilot|guided|uniform", "spp": n, "record": share}, ...] or null,
          "uniform_fraction": a or null, "pilot_spp": n or null, "keep_pilot": true, "seed": 0, "threads": 0}
 
         Returns image (h,w,3), variance (h,w,3) [variance of the mean], and "record": JSON string with
         {"chosen", "a", "k", "parametrisation", "emitter_strategy", "seed", "threads", "camera_rays", "paths_found",
          "nonzero", "nonzero_share", "outside", "non_finite", "pilot": {same counts}, "mean": [r,g,b],
          "variance": relMSE's formula with the own variance of the mean, "max_weight", "max_contribution", "ess",
-         "passes": [{"kind","spp"}], "notes": [str], "training": {...}, "seconds": {"pilot","fit","render"}},
+         "passes": [{"kind","spp","record"}], "notes": [str], "training": {...}, "seconds": {"pilot","fit","render"}},
         and "guide": Guide | None.
         """
     # For parity tests: values of single plugins.

@@ -248,7 +248,7 @@ def registry() -> dict[str, dict[str, Any]]:
 
 
 def guide_names() -> list[str]:
-    """All names that `guide=` understands; those of the registry may be joined by `+` where they model other numbers."""
+    """All names that `guide=` understands; those of the registry may be joined by `+`."""
     return ["none", *registry()]
 
 

@@ -1,10 +1,11 @@
 """Errors of images against a truth.
 
-relMSE = mean over pixels and channels of (x − r)²/(r² + ε), ε = (0.1 · mean r)², minus the truth's own relative variance,
-mean of var(r)/(r² + ε): a noisy truth adds its variance to every squared difference. Since a few fireflies can decide a
-mean, it is always reported with and without the worst 0.1 % of the pixels.
+relMSE = mean over pixels and channels of (x − r)²/(r² + ε), ε = (0.1 · mean r)², minus the truth's own relative
+variance, mean of var(r)/(r² + ε): a noisy truth adds its variance to every squared difference. Since a few fireflies
+can decide a mean, it is always reported with and without the worst 0.1 % of the pixels.
 
-Images are (H, W, 3) radiance in W·sr⁻¹·m⁻² (any last axis works). Sums are in double precision. Nothing here knows Mitsuba.
+Images are (H, W, 3) radiance in W·sr⁻¹·m⁻² (any last axis works). Sums are in double precision; nothing here knows
+Mitsuba.
 """
 
 from __future__ import annotations

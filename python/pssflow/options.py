@@ -34,7 +34,7 @@ PARAMETRISATIONS = ("bsdf", "cosine", "uniform")
 """What a direction's two numbers mean: the BSDF's own sampling, a cosine-weighted or a uniform hemisphere."""
 
 EMITTER_STRATEGIES = ("mis", "nee", "auto")
-"""How the light is joined at x_k: emitter and BSDF samples weighted by MIS, emitter samples alone, or whichever pays."""
+"""How the light is joined at x_k: emitter and BSDF samples (MIS), emitter samples alone, or whichever pays."""
 
 PASS_KINDS = ("pilot", "guided", "uniform")
 
@@ -244,7 +244,10 @@ def check_passes(replay: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
             raise ValueError(f'`replay`[{i}] = {entry!r}: expected {{"kind": …, "spp": …}}')
         kind = check_choice(f"replay[{i}].kind", entry["kind"], PASS_KINDS)
         spp = check_integer(f"replay[{i}].spp", entry["spp"], 1, MAX_SPP)
-        checked.append({"kind": kind, "spp": spp})
+        record = float(entry.get("record", 1.0))
+        if not 0.0 <= record <= 1.0:
+            raise ValueError(f"`replay[{i}].record` = {record}: expected a share in [0, 1]")
+        checked.append({"kind": kind, "spp": spp, "record": record})
     return checked
 
 

@@ -6,6 +6,7 @@ dashed blue: told apart without colour, too), and the relative squared error in 
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,7 +31,7 @@ EXPOSED = 0.97
 """This quantile of the reference's pixels that carry light is shown as white."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class Panel:
     """One image of a picture."""
 
@@ -108,8 +109,15 @@ class Picture:
         texts = 0.27 + 0.17 * max(len(p.lines) for p in panels)
         small = wide / 3 + 0.2
         row_height = texts + tall + small + 0.22
-        head, foot = 0.62, 0.22 + 0.17 * (self.caption.count("\n") + 2)
-        total = (columns * (wide + 0.14) + 0.2, len(self.rows) * row_height + head + foot)
+        across = columns * (wide + 0.14) + 0.2
+        note = (
+            f"All images under one exposure (×{exposure:.3g}, sRGB); each inset under one of its own, "
+            f"the same in every column ({', '.join(f'×{x:.3g}' for x in insets)}). "
+            f"Maps (error²): relative squared error, smoothed, from black, 0, to yellow, {style.top:.2g} and more."
+        )
+        caption = _wrapped(f"{self.caption}\n{note}".strip(), across - 0.28)
+        head, foot = 0.62, 0.34 + 0.165 * (caption.count("\n") + 1)
+        total = (across, len(self.rows) * row_height + head + foot)
         figure = Figure(figsize=total, dpi=150, facecolor=BACKGROUND)
         FigureCanvasAgg(figure)
         page = _Page(figure, total, wide, tall, texts)
@@ -123,14 +131,8 @@ class Picture:
                 page.text(0.14, y + texts, row.note, size=10, linespacing=1.6)
             for c, panel in enumerate(row.panels):
                 page.panel(panel, 0.14 + (first + c) * (wide + 0.14), y, style)
-        note = (
-            f"All images under one exposure (×{exposure:.3g}, sRGB); each inset under one of its own, "
-            f"the same in every column ({', '.join(f'×{x:.3g}' for x in insets)}). "
-            "Maps: relative squared error, smoothed, black 0 to yellow "
-            f"{style.top:.2g} and more."
-        )
         foot_y = head + len(self.rows) * row_height
-        page.text(0.14, foot_y + 0.12, f"{self.caption}\n{note}".strip(), size=8, color=MUTED)
+        page.text(0.14, foot_y + 0.12, caption, size=8, color=MUTED)
         write_beside(path, lambda part: figure.savefig(part, format="png"))
 
 
@@ -245,6 +247,12 @@ def display(image: Array, exposure: float) -> Array:
     broken = ~np.isfinite(image).all(axis=-1)
     shown[broken] = (1.0, 0.0, 1.0)
     return shown
+
+
+def _wrapped(text: str, inches: float) -> str:
+    """Lines broken to fit a width, at matplotlib's 8 points: about 14 characters an inch."""
+    lines = (textwrap.fill(line, int(14 * inches)) for line in text.splitlines())
+    return "\n".join(lines)
 
 
 def exposure_of(image: Array) -> float:

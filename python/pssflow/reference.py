@@ -2,7 +2,8 @@
 
 truth = `path` with max_depth k + 1 minus `path` with max_depth k, the same film and filter, no Russian roulette before
 depth k + 2. In LLVM variants both are rendered from the same seed: they share all random numbers up to the last
-bounce, so that the common terms cancel exactly. In `scalar_rgb` the streams part ways, and the truth needs more samples.
+bounce, so that the common terms cancel exactly. In `scalar_rgb` the streams part ways, and the truth needs far more
+samples.
 
 It is averaged over passes of other seeds; their spread gives each pixel's variance of the mean. This is a truth to
 measure against, not a competitor: it renders the directly lit scene as well, only to throw it away.
@@ -15,8 +16,8 @@ import json
 import math
 import os
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ from numpy.typing import NDArray
 
 from . import metrics
 from .export import Export, export
+from .export.sensors import select_sensor
 from .files import first_line, write_beside
 from .options import MAX_BOUNCES, check_integer, check_number
 from .progress import Progress, reporting
@@ -59,7 +61,7 @@ class Reference:
     variance: F32
     """Variance of each mean, (H, W, 3); zero where it is unknown (an image from elsewhere)."""
     passes: int
-    """Independent images that it is the mean of."""
+    """Independent images that it is the mean of; 0 for an image from elsewhere."""
     spp: int
     """Samples per pixel in all, of each of the two depths."""
     seconds: float
@@ -85,7 +87,7 @@ class Reference:
             "passes": self.passes,
             "spp": self.spp,
             "seconds": self.seconds,
-            "standard_error": metrics.finite_or_none(self.standard_error),
+            "standard_error": metrics.finite_or_none(self.standard_error) if self.passes else None,
             "reached": self.reached,
             "mean": [float(c) for c in self.image.mean(axis=(0, 1), dtype=np.float64)],
             "note": self.note,
@@ -145,7 +147,7 @@ def reference(
     )
 
     notices: list[str] = []
-    mi_scene, name = load_scene(scene, notices)
+    mi_scene, _ = load_scene(scene, notices)
     camera = scene.sensor if isinstance(scene, Scene) else sensor
     # Anew even for a `Scene`: it may have been edited since, and the cache must not mix two states.
     exported = export(mi_scene, camera)
@@ -153,13 +155,18 @@ def reference(
     total = _load(path, notices) if path is not None else None
     reused = 0 if total is None else total.passes
     film = exported.description["film"]["crop_size"]
-    renderer = _Renderer(mi_scene, camera, k)
     if total is None:
         total = _Running.empty(film, max(PATHS_PER_PASS // (film[0] * film[1]), 1))
-
+    renderer = _Renderer(mi_scene, camera, k)
+    saved = time.monotonic()
     with reporting(progress) as listener:
+        passes = _more(total, renderer, seed0, limit, target, listener)
         try:
-            _accumulate(total, renderer, seed0, limit, target, listener, lambda: _save(path, total))
+            # A state is made whole before it gets its name: Ctrl-C never leaves a half-added pass to be saved.
+            for total in passes:
+                if time.monotonic() - saved > SAVE_EVERY:
+                    _save(path, total)
+                    saved = time.monotonic()
         finally:
             renderer.restore()
             if total.passes > reused:
@@ -204,7 +211,7 @@ def read_exr(path: str | Path) -> Reference:
         if bad:
             raise ValueError(f"{path}: {bad} values of its {what} are not finite")
     note = f"read from {path}" + ("" if "variance" in layers else ", its own noise unknown")
-    return Reference(image, variance, passes=1, spp=0, seconds=0.0, note=note, path=path)
+    return Reference(image, variance, passes=0, spp=0, seconds=0.0, note=note, path=path)
 
 
 def default_cache() -> Path:
@@ -226,7 +233,7 @@ def cache_path(folder: str | Path, exported: Export, k: int, seed0: int = 0) -> 
     return Path(folder) / f"{digest.hexdigest()[:20]}-k{k}-{width}x{height}+{x}+{y}.npz"
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Running:
     """Mean and sum of squared deviations over passes (Welford 1962), (H, W, 3) in double precision."""
 
@@ -243,11 +250,19 @@ class _Running:
         shape = (size[1], size[0], 3)
         return cls(np.zeros(shape), np.zeros(shape), 0, spp_per_pass, 0.0, 0, 0)
 
-    def add(self, image: F64) -> None:
-        self.passes += 1
+    def with_pass(self, image: F64, *, spp: int, non_finite: int, seconds: float) -> _Running:
+        """The state after one more pass."""
         delta = image - self.mean
-        self.mean += delta / self.passes
-        self.m2 += delta * (image - self.mean)
+        mean = self.mean + delta / (self.passes + 1)
+        return replace(
+            self,
+            mean=mean,
+            m2=self.m2 + delta * (image - mean),
+            passes=self.passes + 1,
+            seconds=self.seconds + seconds,
+            spp=self.spp + spp,
+            non_finite=self.non_finite + non_finite,
+        )
 
     def variance(self) -> F64:
         """Of the mean."""
@@ -262,7 +277,7 @@ class _Renderer:
 
     def __init__(self, scene: Any, sensor: Any, k: int) -> None:
         self.scene = scene
-        self.camera = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+        self.camera = select_sensor(scene, sensor)
         self.jit = not scene.variant_name().startswith("scalar")
         self.deep, self.shallow = (
             mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": k + 2})
@@ -296,35 +311,29 @@ class _Renderer:
         return raw[..., :3] / np.where(weight == 0.0, 1.0, weight)
 
 
-def _accumulate(
+def _more(
     total: _Running,
     renderer: Callable[[int, int], tuple[F64, int, int]],
     seed0: int,
     limit: float,
     target: float,
     listener: Callable[[str, float], None] | None,
-    save: Callable[[], None],
-) -> None:
-    """Adds passes until the error or the time is reached."""
-    saved, check = time.monotonic(), total.passes
+) -> Iterator[_Running]:
+    """The states after each further pass, until the error or the time is reached; none if they are already."""
+    check = LEAST_PASSES
     while True:
-        if total.passes >= max(check, LEAST_PASSES):
+        if total.passes >= check:
             error = total.standard_error()
             if error <= target or total.seconds >= limit:
                 return
             if listener is not None:
-                listener("reference", max(total.seconds / limit, min((target / error) ** 2, 1.0)))
+                listener("reference", max(total.seconds / limit, (target / error) ** 2))
             # The error falls with the root of the passes: looking at every one would cost more than it saves.
-            check = total.passes + 1 if total.seconds >= limit else _next_check(total, limit)
-        if time.monotonic() - saved > SAVE_EVERY:
-            save()
-            saved = time.monotonic()
+            check = _next_check(total, limit)
         start = time.perf_counter()
         image, spp, bad = renderer(seed0 + total.passes, total.spp_per_pass)
-        total.add(image)
-        total.spp += spp
-        total.non_finite += bad
-        total.seconds += time.perf_counter() - start
+        total = total.with_pass(image, spp=spp, non_finite=bad, seconds=time.perf_counter() - start)
+        yield total
 
 
 def _next_check(total: _Running, limit: float) -> int:
@@ -351,7 +360,7 @@ def _writable_cache(
     """The file to use, its folder made; None without a cache. A default that cannot be written is no error."""
     if cache is False:
         return None
-    default = cache is None or cache is True
+    default = not isinstance(cache, (str, Path))
     folder = default_cache() if default else Path(cache)
     path = cache_path(folder, exported, k, seed0)
     try:
@@ -371,7 +380,8 @@ def _load(path: Path, notices: list[str]) -> _Running | None:
     if not path.exists():
         return None
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        # numpy leaves a file open that it cannot understand.
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             if int(stored["format"]) != FORMAT:
                 return None
             return _Running(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,12 +16,15 @@ from .render import Result
 
 __all__ = [
     "compare_picture",
+    "count",
+    "gain",
     "number",
     "panel",
     "percent",
     "reference_panel",
     "runs_table",
     "scene_info",
+    "scene_title",
 ]
 
 PER_ROW = 4
@@ -71,27 +75,25 @@ def compare_picture(
     scene: str, runs: Sequence[Result], truth: Reference, caption: str
 ) -> Picture:
     """The reference and all runs, a few to a row."""
-    panels = [panel(run, truth, [other.stats for other in runs]) for run in runs]
+    records = [run.stats for run in runs]
+    panels = [panel(run, truth, gain=gain(run.stats, records)) for run in runs]
     rows = [Row(panels[i : i + PER_ROW]) for i in range(0, len(panels), PER_ROW)]
     stats = runs[0].stats
     bounces = "1 bounce" if stats["k"] == 1 else f"{stats['k']} bounces"
-    heading = f"{scene}: light of exactly {bounces} ({stats['parametrisation']}, {stats['emitter_strategy']})"
+    heading = f"{scene_title(scene)}: light of exactly {bounces} ({stats['parametrisation']}, {stats['emitter_strategy']})"
     return Picture(heading, rows, reference_panel(truth), caption=caption)
 
 
-def panel(
-    run: Result, truth: Reference, runs: Sequence[Mapping[str, Any]] = (), title: str = ""
-) -> Panel:
+def panel(run: Result, truth: Reference, *, gain: str = "", title: str = "") -> Panel:
     """One run's image with its budget word for word, its errors and its shares."""
     stats = run.stats
-    won = gain(stats, runs)
-    better = f", gain {won}" if won not in ("", "1") else ""
+    won = f", gain {gain}" if gain not in ("", "1") else ""
     return Panel(
         title=title or stats["guide"],
         image=run.image,
         lines=[
             stats["budget"],
-            f"relMSE {number(stats['relmse'])} (trimmed {number(stats['relmse_trimmed'])}){better}",
+            f"relMSE {number(stats['relmse'])} (trimmed {number(stats['relmse_trimmed'])}){won}",
             f"non-zero {percent(stats['nonzero_share'])} of {count(stats['paths_found'])} paths found",
         ],
         error=error_map(run.image, truth.image, metrics.epsilon(truth.image)),
@@ -130,6 +132,12 @@ def scene_info(record: Mapping[str, Any]) -> list[Any]:
         guides.add_row(name, f"{guide['summary']}\n{options}")
     refused = [f"not supported: {line}" for line in record["unsupported"]]
     return [found, *(refused or ["Everything in it is supported."]), guides]
+
+
+def scene_title(name: str) -> str:
+    """A scene's name without its folders: `scenes/teapot/scene.xml` is called `teapot`."""
+    path = Path(name)
+    return path.parent.name if path.name == "scene.xml" and path.parent.name else path.stem or name
 
 
 def number(value: float | None, digits: int = 4) -> str:

@@ -35,7 +35,7 @@ def llvm_problem() -> str | None:
     """Why Mitsuba's LLVM variants cannot be used here, and what to do; None if they can."""
     if not dr.has_backend(dr.JitBackend.LLVM):
         return "libLLVM was not found: install libllvm19 (or newer), or set DRJIT_LIBLLVM_PATH"
-    version = dr.detail.llvm_version()  # pyright: ignore[reportAttributeAccessIssue]
+    version = dr.detail.llvm_version()
     if version[0] < OLDEST_LLVM:
         found = ".".join(str(n) for n in version)
         return (

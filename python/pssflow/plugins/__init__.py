@@ -1,8 +1,9 @@
 """Mitsuba plugins of pssflow. To add one: a module with `define()`, and a row in `PLUGINS`.
 
-A plugin written in Python belongs to the variant that was active when its class was defined, since it inherits from that
-variant's classes; Mitsuba also forgets registrations when the variant changes. So each change defines and registers all
-of them anew. Mitsuba's own `mitsuba` command knows nothing of Python plugins: render through `mi.render` or `pssflow`.
+A plugin written in Python belongs to the variant that was active when its class was defined, since it inherits from
+that variant's classes; Mitsuba also forgets registrations when the variant changes. So each change defines and
+registers all of them anew. Mitsuba's own `mitsuba` command knows nothing of Python plugins: render through `mi.render`
+or `pssflow`.
 """
 
 from __future__ import annotations

@@ -54,13 +54,13 @@ Learned light of exactly k bounces (:monosp:`pssflow`)
 
 Renders only light that was reflected exactly k times on its way from an emitter: no emitter is seen, and for k = 2 no
 direct light. The image is unbiased for every guide as long as ``uniform_fraction`` is positive, since each sample is
-divided by the mixture's density; the preset ``thesis`` has none and may be biased. A guide costs a pilot and training in
-every call of ``render``: expect no gain at few samples, nor in easy scenes, and compare with ``guide`` = ``none``.
+divided by the mixture's density; the preset ``thesis`` has none and may be biased. A guide costs a pilot and training
+in every call of ``render``: expect no gain at few samples, nor in easy scenes, and compare with ``guide`` = ``none``.
 
-Paths are traced by pssflow's core on all cores, not by Mitsuba, in ``scalar_rgb`` and ``llvm_ad_rgb``; other variants know
-no such plugin. The scene is read anew in each call, edits through ``mi.traverse`` included, and may hold only what
-``pssflow info`` calls supported. Alpha is 1 everywhere. Nothing is differentiated: gradients raise an error. Attribute
-``result`` keeps the last ``pssflow.Result``: variance, statistics, the guide.
+Paths are traced by pssflow's core, not by Mitsuba, in ``scalar_rgb`` and ``llvm_ad_rgb``; other variants know no such
+plugin. The scene is read anew in each call, edits through ``mi.traverse`` included, and may hold only what ``pssflow
+info`` calls supported. Alpha is 1 everywhere. Nothing is differentiated: gradients raise an error. Attribute ``result``
+keeps the last ``pssflow.Result``: variance, statistics, the guide.
 
 .. tabs::
     .. code-tab:: xml
@@ -204,8 +204,8 @@ def _fill(film: Any, image: Any) -> None:
     # R G B W, or R G B A W; the image is filtered and divided by its weights already.
     values = np.ones((*image.shape[:2], channels), np.float32)
     values[..., :3] = image
-    block = mi.ImageBlock(mi.TensorXf(values), film.crop_offset(), border=False)
-    film.put_block(block)
+    tensor: Any = mi.TensorXf(values)
+    film.put_block(mi.ImageBlock(tensor, film.crop_offset(), border=False))
 
 
 def _scalar(seed: Any) -> int:
@@ -215,6 +215,9 @@ def _scalar(seed: Any) -> int:
 
 def _without_warning(construct: Callable[[Any], None], props: Any) -> None:
     """Keeps back Mitsuba's warning that integrators in Python are slow in scalar variants: this one runs in Rust."""
+    if not (mi.variant() or "").startswith("scalar"):
+        construct(props)
+        return
     level = mi.log_level()
     mi.set_log_level(mi.LogLevel.Error)
     try:

@@ -25,12 +25,11 @@ from typing import Any
 import click
 import drjit as dr
 import mitsuba as mi
-from rich.console import Console
 from rich.table import Table
 
-from ..cli import run_command
 from ..output import make_folder, write_json
 from ..scene import Scene
+from ..terminal import Terminal, run_command
 from ..variants import llvm_problem
 
 SCENES = ("cornell-box", "teapot")
@@ -49,16 +48,19 @@ class Contestant:
     """Where `rays_per_path` comes from."""
 
 
-@click.command()
+@click.command("bench")
 @click.option("-o", "--output", default="out", show_default=True, help="Folder for bench.json.")
 @click.option("--scenes", "folder", default="scenes", show_default=True, help="Folder of scenes.")
 @click.option("--spp", default=16, show_default=True, type=click.IntRange(1), help="Samples a pixel.")
 @click.option("--rounds", default=5, show_default=True, type=click.IntRange(1))
 @click.option("--scale", default=1.0, show_default=True, help="Factor on the film's size.")
 @click.option("-k", "--bounces", "k", default=2, show_default=True, type=click.IntRange(1, 32))
-def bench(output: str, folder: str, spp: int, rounds: int, scale: float, k: int) -> None:
+@click.pass_obj
+def bench(
+    terminal: Terminal, output: str, folder: str, spp: int, rounds: int, scale: float, k: int
+) -> None:
     """Measures paths per second; writes bench.json."""
-    console = Console()
+    console = terminal.out
     target = make_folder(output) / "bench.json"
     before = os.getloadavg()
     console.print(

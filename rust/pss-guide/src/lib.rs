@@ -104,7 +104,7 @@ pub trait Guide: Send + Sync + std::fmt::Debug {
     /// the same row to about 1e-4 relative (f32 throughout).
     fn density(&self, decision: Decision, contexts: &[Context], u: &[f32], q: &mut [f32]);
 
-    /// Estimated share of samples outside the cube (standard error ≤ 0.002); 0 where none can be.
+    /// Share of 65,536 fixed samples that fell outside the cube (standard error at most 0.002).
     fn mass_outside(&self) -> f64;
 
     /// Number of trained parameters.

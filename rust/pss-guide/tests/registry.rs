@@ -151,14 +151,18 @@ fn the_loss_falls_and_is_a_likelihood_on_the_cube() {
     }
 }
 
-/// Claim, stated beforehand: trained on 16,384 points of two moons by default options and 20 epochs, a guide's
-/// mean ln q of fresh points is within 0.45 nats of the truth's (about 1.2); a normal of the
-/// same mean and covariance is 0.75 below the truth.
+/// Claim, stated beforehand: trained on 8192 points of two moons for 15 epochs, a guide's mean ln q of
+/// fresh points is within 0.25 nats of the truth's, which is 1.49; a normal with the points' own mean and
+/// covariance stays 0.9 below it.
 #[test]
 fn two_moons_are_learned() {
-    let (train, test) = (moons::points(16_384, 1), moons::points(8192, 2));
+    let (train, test) = (moons::points(8192, 1), moons::points(8192, 2));
     let truth = moons::mean_log_density(&test);
-    let one = vec![1.0; 16_384];
+    assert!(
+        moons::normal_log_density(&test) < truth - 0.8,
+        "the claim would say little"
+    );
+    let one = vec![1.0; 8192];
     let records = Records {
         dims: 2,
         u: &train,
@@ -171,7 +175,7 @@ fn two_moons_are_learned() {
     for spec in registry() {
         let guide = fit(
             spec.name,
-            &options(&[("epochs", 20.into())]),
+            &options(&[("epochs", 15.into())]),
             &records,
             1,
             &mut |_| true,
@@ -181,13 +185,8 @@ fn two_moons_are_learned() {
         let mut q = vec![0.0; 8192];
         guide.density(Decision::Path, &[], &test, &mut q);
         let mean = q.iter().map(|&q| f64::from(q).ln()).sum::<f64>() / 8192.0;
-        println!(
-            "{}: {mean:.3}, truth {truth:.3}, normal {:.3}",
-            spec.name,
-            moons::normal_log_density(&test)
-        );
         assert!(
-            mean > truth - 0.45,
+            mean > truth - 0.25,
             "{}: mean ln q = {mean:.3}, truth {truth:.3}",
             spec.name
         );
@@ -211,7 +210,7 @@ fn a_saved_guide_is_the_same_guide() {
             u.into_iter().chain(q).map(f32::to_bits).collect::<Vec<_>>()
         };
         assert_eq!(
-            run(&*guide),
+            run(&**guide),
             run(&*load(&path, &header()).unwrap()),
             "{}",
             spec.name

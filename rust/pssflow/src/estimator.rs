@@ -90,6 +90,9 @@ const PILOT_TIME: f64 = 1.0 / 7.0;
 /// Samples per pixel of a pilot under `--spp`: this share of the total.
 const PILOT_SPP: u32 = 4;
 
+/// Samples per pixel that a timed pilot's memory for records is planned for.
+const TIMED_PILOT_SPP: u32 = 64;
+
 /// Renders the k-bounce indirect light of `scene`.
 ///
 /// With [`Budget::Spp`] or [`Budget::Replay`], one seed gives one image, bit for bit, for any number of
@@ -110,7 +113,6 @@ pub fn render(
         seed: options.seed,
         progress,
         pool: &pool,
-        max_records: options.max_records,
     };
     let mut run = Run {
         context,
@@ -172,28 +174,39 @@ impl Run<'_> {
     fn pilot(&mut self) -> Result<PilotRecords, RenderError> {
         let start = Instant::now();
         let mut records = PilotRecords::default();
-        let plan = match &self.options.budget {
-            Budget::Spp(spp) => Some(self.options.pilot_spp.unwrap_or((spp / PILOT_SPP).max(1))),
-            Budget::Replay(passes) => {
+        match (self.options.budget.clone(), self.options.pilot_spp) {
+            (Budget::Replay(passes), _) => {
                 let pilots = passes.iter().filter(|p| p.kind == PassKind::Pilot);
-                Some(pilots.map(|p| p.spp).sum())
+                let total: u32 = pilots.clone().map(|p| p.spp).sum();
+                let mut done = 0;
+                for pass in pilots {
+                    let share = |n: u32| n as f32 / total as f32;
+                    let span = (share(done), share(done + pass.spp));
+                    self.pilot_pass(pass.spp, pass.record, span, &mut records)?;
+                    done += pass.spp;
+                }
             }
-            Budget::Time(_) => self.options.pilot_spp,
-        };
-        match plan {
-            Some(0) => {}
-            Some(spp) => self.pilot_pass(spp, spp, (0.0, 1.0), &mut records)?,
-            None => {
+            (Budget::Spp(_) | Budget::Time(_), Some(spp)) => {
+                self.pilot_pass(spp, self.record_share(spp), (0.0, 1.0), &mut records)?;
+            }
+            (Budget::Spp(spp), None) => {
+                let spp = (spp / PILOT_SPP).max(1);
+                self.pilot_pass(spp, self.record_share(spp), (0.0, 1.0), &mut records)?;
+            }
+            (Budget::Time(time), None) => {
                 // One sample a pixel, then as many more as its measured speed allows.
-                let Budget::Time(time) = self.options.budget else {
-                    return Ok(records);
-                };
-                let share = time * PILOT_TIME;
-                self.pilot_pass(1, 64, (0.0, 0.1), &mut records)?;
+                self.pilot_pass(
+                    1,
+                    self.record_share(TIMED_PILOT_SPP),
+                    (0.0, 0.1),
+                    &mut records,
+                )?;
                 let each = start.elapsed().as_secs_f64();
-                let more = ((share - each) / each).clamp(0.0, f64::from(1 << 20)) as u32;
+                let more =
+                    ((time * PILOT_TIME - each) / each).clamp(0.0, f64::from(1 << 20)) as u32;
                 if more > 0 {
-                    self.pilot_pass(more, more + 1, (0.1, 1.0), &mut records)?;
+                    let record = self.record_share(more.max(TIMED_PILOT_SPP));
+                    self.pilot_pass(more, record, (0.1, 1.0), &mut records)?;
                 }
             }
         }
@@ -201,18 +214,20 @@ impl Run<'_> {
         Ok(records)
     }
 
+    /// Share of the light-carrying paths to keep so that a pilot of `spp` fits the memory for records, even
+    /// if every path carries light. At random, since every other rule would prefer a part of the image.
+    fn record_share(&self, spp: u32) -> f32 {
+        let paths = self.context.tracer.scene().film().pixels() as f64 * f64::from(spp);
+        (self.options.max_records as f64 / paths).min(1.0) as f32
+    }
+
     fn pilot_pass(
         &mut self,
         spp: u32,
-        expected: u32,
+        record: f32,
         span: (f32, f32),
         records: &mut PilotRecords,
     ) -> Result<(), RenderError> {
-        // Thinned so that the expected number of records fits; at random, since every other rule would
-        // prefer a part of the image.
-        let pixels = self.context.tracer.scene().film().pixels() as f64;
-        let all = pixels * f64::from(expected);
-        let record = (self.context.max_records as f64 / all).min(1.0) as f32;
         let pass = Pass {
             phase: Phase::Pilot,
             first_sample: self.next_sample,
@@ -231,12 +246,13 @@ impl Run<'_> {
         let mut result = self.context.render(&pass, image)?;
         let zeros = result.statistics.counts.camera_rays - result.statistics.counts.nonzero;
         result.records.zeros = (zeros as f64 * f64::from(record)) as u64;
-        records.extend(result.records);
+        records.append(&mut result.records);
         self.pilot.add(&result.statistics);
         self.next_sample += spp;
         self.passes.push(PassPlan {
             kind: PassKind::Pilot,
             spp,
+            record,
         });
         Ok(())
     }
@@ -402,7 +418,11 @@ impl Run<'_> {
         } else {
             PassKind::Uniform
         };
-        self.passes.push(PassPlan { kind, spp });
+        self.passes.push(PassPlan {
+            kind,
+            spp,
+            record: 1.0,
+        });
         Ok(())
     }
 

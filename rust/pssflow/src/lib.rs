@@ -22,7 +22,6 @@ pub use error::RenderError;
 pub use estimator::{Outcome, Seconds, render};
 pub use mixture::Mixture;
 pub use options::{Budget, GuideChoice, Learner, Options, PassKind, PassPlan};
-pub use pass::{PassContext, PilotRecords};
 pub use progress::{Phase, Progress, Silent};
 pub use statistics::{Counts, Statistics};
 pub use trace::{RayTiming, rays_alone, trace_blocks, uniform_paths};

@@ -60,12 +60,20 @@ pub enum PassKind {
 }
 
 /// One pass over the image; a list of these is the record from which a render is replayed.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct PassPlan {
     /// What its paths are.
     pub kind: PassKind,
     /// Samples per pixel.
     pub spp: u32,
+    /// Share of a pilot's light-carrying paths that is kept for training; chosen before the pass.
+    #[serde(default = "all")]
+    pub record: f32,
+}
+
+fn all() -> f32 {
+    1.0
 }
 
 /// All options of a render.

@@ -26,17 +26,15 @@ const CHUNK: u32 = 16;
 const BATCH: usize = 128;
 
 /// What all passes of a render share.
-pub struct PassContext<'a> {
+pub(crate) struct PassContext<'a> {
     /// The tracer.
-    pub tracer: Tracer<'a>,
+    pub(crate) tracer: Tracer<'a>,
     /// Seed of the paths' numbers.
-    pub seed: u64,
+    pub(crate) seed: u64,
     /// Listener.
-    pub progress: &'a dyn Progress,
+    pub(crate) progress: &'a dyn Progress,
     /// Threads.
-    pub pool: &'a rayon::ThreadPool,
-    /// Training paths kept at most.
-    pub max_records: usize,
+    pub(crate) pool: &'a rayon::ThreadPool,
 }
 
 /// Appends the uniform numbers of one path, and its film position, to a block; returns its coin and the
@@ -81,27 +79,23 @@ pub(crate) struct Pass<'a> {
 
 /// Light-carrying paths of a pilot, and the number of those that carry none.
 #[derive(Clone, Debug, Default)]
-pub struct PilotRecords {
+pub(crate) struct PilotRecords {
     /// Learned numbers, 2k + 1 a path.
-    pub u: Vec<f32>,
+    pub(crate) u: Vec<f32>,
     /// Luminance of f.
-    pub f: Vec<f32>,
+    pub(crate) f: Vec<f32>,
     /// Largest RGB component of f.
-    pub f_max: Vec<f32>,
+    pub(crate) f_max: Vec<f32>,
     /// Density that each was drawn from.
-    pub g: Vec<f32>,
+    pub(crate) g: Vec<f32>,
     /// Film position, [0, 1)².
-    pub pixel: Vec<[f32; 2]>,
+    pub(crate) pixel: Vec<[f32; 2]>,
     /// Paths without light.
-    pub zeros: u64,
+    pub(crate) zeros: u64,
 }
 
 impl PilotRecords {
-    pub(crate) fn extend(&mut self, mut other: Self) {
-        self.append(&mut other);
-    }
-
-    fn append(&mut self, other: &mut Self) {
+    pub(crate) fn append(&mut self, other: &mut Self) {
         self.u.append(&mut other.u);
         self.f.append(&mut other.f);
         self.f_max.append(&mut other.f_max);

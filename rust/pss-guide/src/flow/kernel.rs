@@ -361,4 +361,29 @@ mod tests {
         assert_eq!(tanh(1e9), 1.0);
         assert_eq!(tanh(-1e9), -1.0);
     }
+
+    #[test]
+    fn every_instruction_set_gives_the_same_flow() {
+        use crate::flow::options::RealNvpOptions;
+        use crate::flow::{Domain, weights::Shape};
+        let options = RealNvpOptions::defaults(Domain::Logit);
+        let weights = Weights::random(Shape::new(5, &options), 1);
+        let kernel = Kernel::new(&weights, options.s_max);
+        let z: Vec<f32> = (0..5 * 37).map(|i| (i as f32).sin()).collect();
+        for direction in [Direction::Generate, Direction::Normalise] {
+            let (mut fast, mut det) = (z.clone(), vec![0.0; 37]);
+            kernel.run(direction, &mut fast, &mut det);
+            let (mut slow, mut slow_det) = (z.clone(), vec![0.0; 37]);
+            let pass = Pass {
+                kernel: &kernel,
+                direction,
+                x: &mut slow,
+                log_det: &mut slow_det,
+            };
+            Simd::vectorize(pulp::Scalar, pass);
+            let close = |(a, b): (&f32, &f32)| (a - b).abs() < 1e-5 * (1.0 + b.abs());
+            assert!(fast.iter().zip(&slow).all(close), "{fast:?} {slow:?}");
+            assert!(det.iter().zip(&slow_det).all(close), "{det:?} {slow_det:?}");
+        }
+    }
 }

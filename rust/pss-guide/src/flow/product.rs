@@ -99,14 +99,21 @@ impl Product<'_, '_> {
                     .for_each(|(to, &from)| *to = from);
             }
         }
+        let mut rows = vec![[0.0; R]; self.k];
         let (b, _) = pulp::as_arrays::<V, _>(S::as_simd_f32s(panel).0);
         for top in (0..self.m).step_by(R) {
             let mut sum = [[simd.splat_f32s(0.0); V]; R];
             // Rows beyond the last repeat it; their sums are not stored.
-            let start: [usize; R] = std::array::from_fn(|r| (top + r).min(self.m - 1) * self.a.row);
-            for (i, b) in b.iter().enumerate() {
-                for (sum, start) in sum.iter_mut().zip(start) {
-                    let a = simd.splat_f32s(self.a.values[start + i * self.a.column]);
+            for r in 0..R {
+                let start = (top + r).min(self.m - 1) * self.a.row;
+                let row = self.a.values[start..].iter().step_by(self.a.column);
+                rows.iter_mut()
+                    .zip(row)
+                    .for_each(|(to, &from)| to[r] = from);
+            }
+            for (a, b) in rows.iter().zip(b) {
+                for (sum, &a) in sum.iter_mut().zip(a) {
+                    let a = simd.splat_f32s(a);
                     for (sum, &b) in sum.iter_mut().zip(b) {
                         *sum = simd.mul_add_e_f32s(a, b, *sum);
                     }

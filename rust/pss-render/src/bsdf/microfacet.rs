@@ -174,54 +174,48 @@ impl Distribution {
         }
     }
 
-    /// The share of light from direction wi (cos θ = `mu`) that the rough interface of relative index
-    /// `eta` reflects, by a tensor Gauss–Legendre rule over the visible normals.
-    pub(crate) fn reflectance(&self, mu: f32, eta: f32) -> f32 {
-        let wi = Vec3::new(safe_sqrt(1.0 - mu * mu), 0.0, mu);
-        self.integrate(
-            eta,
-            |m| {
-                let wo = reflect(wi, m);
-                let f = fresnel::dielectric(wi.dot(m), eta).reflectance;
-                if wo.z > 0.0 {
-                    self.smith_g1(wo, m) * f
-                } else {
-                    0.0
-                }
-            },
-            wi,
-        )
+    /// The share of light from direction cos θ = `mu` that the rough interface of relative index `eta`
+    /// reflects, for each of `mu`: a tensor Gauss–Legendre rule over the visible normals.
+    pub(crate) fn reflectance(&self, mu: &[f32], eta: f32) -> Vec<f32> {
+        self.integrate(mu, eta, |wi, m| {
+            let wo = reflect(wi, m);
+            let f = fresnel::dielectric(wi.dot(m), eta).reflectance;
+            if wo.z > 0.0 {
+                self.smith_g1(wo, m) * f
+            } else {
+                0.0
+            }
+        })
     }
 
     /// The share that it lets through.
-    pub(crate) fn transmittance(&self, mu: f32, eta: f32) -> f32 {
-        let wi = Vec3::new(safe_sqrt(1.0 - mu * mu), 0.0, mu);
-        self.integrate(
-            eta,
-            |m| {
-                let f = fresnel::dielectric(wi.dot(m), eta);
-                let wo = fresnel::refract(wi, m, f);
-                if wo.z * wi.z < 0.0 {
-                    self.smith_g1(wo, m) * (1.0 - f.reflectance)
-                } else {
-                    0.0
-                }
-            },
-            wi,
-        )
+    pub(crate) fn transmittance(&self, mu: &[f32], eta: f32) -> Vec<f32> {
+        self.integrate(mu, eta, |wi, m| {
+            let f = fresnel::dielectric(wi.dot(m), eta);
+            let wo = fresnel::refract(wi, m, f);
+            if wo.z * wi.z < 0.0 {
+                self.smith_g1(wo, m) * (1.0 - f.reflectance)
+            } else {
+                0.0
+            }
+        })
     }
 
-    fn integrate(&self, eta: f32, value: impl Fn(Vec3) -> f32, wi: Vec3) -> f32 {
+    fn integrate(&self, mu: &[f32], eta: f32, value: impl Fn(Vec3, Vec3) -> f32) -> Vec<f32> {
         // Same number of nodes as Mitsuba, so that the tables agree to rounding.
         let rule = gauss_legendre(if eta > 1.0 { 32 } else { 128 });
-        let mut sum = 0.0f64;
-        for &(x, wx) in &rule {
-            for &(y, wy) in &rule {
-                let m = self.sample(wi, [(0.5 * x + 0.5) as f32, (0.5 * y + 0.5) as f32]);
-                sum += f64::from(value(m)) * wx * wy * 0.25;
+        let over_normals = |&mu: &f32| {
+            let wi = Vec3::new(safe_sqrt(1.0 - mu * mu), 0.0, mu);
+            let mut sum = 0.0f64;
+            for &(x, wx) in &rule {
+                for &(y, wy) in &rule {
+                    let m = self.sample(wi, [(0.5 * x + 0.5) as f32, (0.5 * y + 0.5) as f32]);
+                    sum += f64::from(value(wi, m)) * wx * wy * 0.25;
+                }
             }
-        }
-        sum as f32
+            sum as f32
+        };
+        mu.iter().map(over_normals).collect()
     }
 }
 

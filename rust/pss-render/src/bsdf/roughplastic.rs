@@ -38,7 +38,7 @@ pub struct RoughPlastic {
     specular_reflectance: Option<TextureId>,
     specular_sampling_weight: f32,
     /// Share of light let in through the rough interface, over cos θ in equal steps.
-    external_transmittance: Box<[f32; RESOLUTION]>,
+    external_transmittance: Vec<f32>,
     /// Share of diffuse light inside that the interface throws back.
     internal_reflectance: f32,
 }
@@ -57,10 +57,10 @@ impl RoughPlastic {
         b.check((0.0..=1.0).contains(&weight), "specular_sampling_weight", weight, "in [0, 1]")?;
         // The tables need visible normals, whatever the BSDF itself samples.
         let tabulated = Distribution::new(d.distribution, d.alpha, d.alpha, true);
-        let node = |i: usize| (i as f32 / (RESOLUTION - 1) as f32).max(1e-6);
-        let internal: f32 = (0..RESOLUTION)
-            .map(|i| tabulated.reflectance(node(i), 1.0 / eta) * node(i))
-            .sum();
+        let nodes: [f32; RESOLUTION] =
+            std::array::from_fn(|i| (i as f32 / (RESOLUTION - 1) as f32).max(1e-6));
+        let internal = tabulated.reflectance(&nodes, 1.0 / eta);
+        let internal: f32 = internal.iter().zip(nodes).map(|(r, mu)| r * mu).sum();
         Ok(Self {
             distribution: Distribution::new(d.distribution, d.alpha, d.alpha, d.sample_visible),
             eta,
@@ -68,9 +68,7 @@ impl RoughPlastic {
             diffuse_reflectance: b.texture(d.diffuse_reflectance)?,
             specular_reflectance: b.optional(d.specular_reflectance)?,
             specular_sampling_weight: weight,
-            external_transmittance: Box::new(std::array::from_fn(|i| {
-                tabulated.transmittance(node(i), eta)
-            })),
+            external_transmittance: tabulated.transmittance(&nodes, eta),
             internal_reflectance: internal / RESOLUTION as f32 * 2.0,
         })
     }

@@ -1,0 +1,218 @@
+"""The thesis' first scene, end to end: `make demo`.
+
+For each parametrisation of direction four images: random numbers and numbers learned as in the thesis (its Table 2:
+16 spp each, the learned ones after 16 spp of pilot that are discarded), and both again at equal spp with the pilot kept and a
+tenth of the paths random, which is how one would use the method. What the thesis lacks is the error, measured against
+Mitsuba's own rendering.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.table import Table
+
+from ..compare import measured_reference, results_folder
+from ..options import PARAMETRISATIONS
+from ..output import write_json
+from ..picture import Picture, Row
+from ..reference import Reference
+from ..render import Result
+from ..report import count, number, panel, percent, reference_panel
+from ..scene import Scene
+from ..terminal import Terminal, run_command
+
+SCENE = Path("scenes/teapot/scene.xml")
+
+REFERENCE_SECONDS = 40.0
+"""On two cores the whole demo is to stay below three minutes."""
+
+THESIS = {"bsdf": (28.27, 52.16), "cosine": (18.87, 46.16), "uniform": (17.73, 40.94)}
+"""Non-zero paths in per cent of the paths found, random and learned: its Table 2."""
+
+THESIS_RAYS = 1_081_600
+"""Camera rays of the same table."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """A row of the table for each parametrisation."""
+
+    name: str
+    """As a file's name."""
+    title: str
+    guide: str
+    arguments: dict[str, Any]
+    thesis: int | None = None
+    """Which of the thesis' two shares stands beside it."""
+
+
+METHODS = (
+    Method("none-16", "random", "none", {"spp": 16}, thesis=0),
+    Method("realnvp-thesis", "realnvp as in the thesis", "realnvp", {}, thesis=1),
+    Method("none-32", "random, equal spp", "none", {"spp": 32}),
+    Method(
+        "realnvp-kept",
+        "realnvp, a = .1, pilot kept",
+        "realnvp",
+        {"spp": 32, "pilot_spp": 8, "uniform_fraction": 0.1, "keep_pilot": True},
+    ),
+)
+
+NOTES = f"""\
+camera rays: here 256² × spp. The thesis' {count(THESIS_RAYS)} are 260² × 16: PBRT samples the filter's border, too.
+found: paths whose two vertices exist; a learned sample outside the cube is a camera ray, but no path found.
+share: non-zero ÷ found. The scene is rebuilt from the thesis' facts, and what exactly it counts as found is not known
+here: compare how a share changes from random to learned, not its level.
+s: pilot, training and rendering. gain: relMSE of random ÷ relMSE of this row at equal total spp; below 1 it is a loss.
+As in the thesis, nothing guards its learned rows (a = 0): where the flow puts no samples, light is missing."""
+
+
+@click.command("demo")
+@click.option("-o", "--output", default="out/demo", show_default=True, help="Folder.")
+@click.option("--scene", "path", default=str(SCENE), show_default=True, help="The teapot.")
+@click.option("--scale", type=float, help="Factor on the film's size, for a quick look.")
+@click.option("--reference-time", default=REFERENCE_SECONDS, show_default=True, help="Seconds.")
+@click.pass_obj
+def demo(
+    terminal: Terminal, output: str, path: str, scale: float | None, reference_time: float
+) -> None:
+    """Random and learned sampling of the thesis' teapot, for all three parametrisations."""
+    start = time.perf_counter()
+    with results_folder(output) as folder:
+        scene = Scene(path, scale=scale)
+        for note in scene.notes:
+            terminal.note(note)
+        runs: dict[tuple[str, str], Result] = {}
+        for parametrisation in PARAMETRISATIONS:
+            for method in METHODS:
+                terminal.say(f"rendering {parametrisation}: {method.title}")
+                runs[parametrisation, method.name] = scene.render(
+                    method.guide,
+                    parametrisation=parametrisation,
+                    preset="thesis",
+                    **method.arguments,
+                )
+        terminal.say(f"Mitsuba's reference, at most {reference_time:g} s unless it is cached")
+        truth = measured_reference(scene, list(runs.values()), reference_time)
+        for run in runs.values():
+            run.measure(truth)
+        _write(folder, scene, runs, truth)
+    terminal.out.print(_table(runs))
+    terminal.out.print(NOTES, highlight=False, soft_wrap=True)
+    terminal.out.print(f"reference: {truth.note}", highlight=False, soft_wrap=True)
+    terminal.out.print(
+        f"{time.perf_counter() - start:.0f} s in all. Look at {folder / 'demo.png'}; images with "
+        f"their variance and records (.exr, .json), and results.json, lie beside it.",
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
+def _write(
+    folder: Path, scene: Scene, runs: dict[tuple[str, str], Result], truth: Reference
+) -> None:
+    """EXRs with their records, the picture, results.json."""
+    for (parametrisation, method), run in runs.items():
+        image = folder / f"{parametrisation}-{method}.exr"
+        run.write(image)
+        write_json(image.with_suffix(".json"), run.stats)
+    truth.write(folder / "reference.exr")
+    write_json(
+        folder / "results.json",
+        {
+            "reference": truth.describe(),
+            "runs": [run.stats | {"method": key[1]} for key, run in runs.items()],
+            "thesis": {
+                "camera_rays": THESIS_RAYS,
+                "nonzero_share": {name: [s / 100 for s in both] for name, both in THESIS.items()},
+            },
+        },
+    )
+    rows = [
+        Row(
+            [
+                panel(
+                    runs[parametrisation, method.name],
+                    truth,
+                    gain=_gain(runs, parametrisation, method),
+                    title=f"{parametrisation}: {method.title}",
+                )
+                for method in METHODS
+            ],
+            note=_shares(runs, parametrisation),
+        )
+        for parametrisation in PARAMETRISATIONS
+    ]
+    heading = (
+        f"The thesis' teapot, light of exactly 2 bounces, {scene.width}×{scene.height}: "
+        "random and learned numbers"
+    )
+    first = reference_panel(truth)
+    first.lines = [*first.lines, *_shares(runs, PARAMETRISATIONS[0]).splitlines()[1:]]
+    Picture(heading, rows, first, caption=f"reference: {truth.note}").draw(folder / "demo.png")
+
+
+def _table(runs: dict[tuple[str, str], Result]) -> Table:
+    """The thesis' Table 2, what it lacks, and its numbers."""
+    shown = Table(
+        title="Light of exactly two bounces, NEE, seed 0", title_justify="left", title_style="bold"
+    )
+    shown.add_column("direction")
+    shown.add_column("numbers")
+    shown.add_column("budget")
+    for heading in ("camera rays", "s", "found", "non-zero", "share", "thesis"):
+        shown.add_column(heading, justify="right")
+    for heading in ("relMSE", "trimmed", "gain"):
+        shown.add_column(heading, justify="right")
+    for parametrisation in PARAMETRISATIONS:
+        for method in METHODS:
+            stats = runs[parametrisation, method.name].stats
+            phases = ("pilot", "fit", "render")
+            thesis = THESIS[parametrisation]
+            shown.add_row(
+                parametrisation if method is METHODS[0] else "",
+                method.title,
+                stats["budget"],
+                count(stats["camera_rays"]),
+                f"{sum(stats['seconds'][phase] for phase in phases):.1f}",
+                count(stats["paths_found"]),
+                count(stats["nonzero"]),
+                percent(stats["nonzero_share"]),
+                "" if method.thesis is None else f"{thesis[method.thesis]:.2f} %",
+                number(stats["relmse"]),
+                number(stats["relmse_trimmed"]),
+                _gain(runs, parametrisation, method),
+                end_section=method is METHODS[-1],
+            )
+    return shown
+
+
+def _gain(runs: dict[tuple[str, str], Result], parametrisation: str, method: Method) -> str:
+    """relMSE of random numbers at the same total spp ÷ this method's."""
+    if method.guide == "none":
+        return ""
+    plain = runs[parametrisation, "none-32"].stats["relmse"]
+    own = runs[parametrisation, method.name].stats["relmse"]
+    return f"{plain / own:.2f}" if plain and own else "–"
+
+
+def _shares(runs: dict[tuple[str, str], Result], parametrisation: str) -> str:
+    """Both pairs of shares in words."""
+    pair = [runs[parametrisation, m.name].stats["nonzero_share"] for m in METHODS[:2]]
+    thesis = THESIS[parametrisation]
+    return (
+        f"{parametrisation}\n"
+        f"non-zero share, random → learned:\n"
+        f"here {percent(pair[0])} → {percent(pair[1])}\n"
+        f"thesis {thesis[0]:.2f} % → {thesis[1]:.2f} %"
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(run_command(demo))
