@@ -1,7 +1,7 @@
 """The command `pssflow`: render, compare, info.
 
-Everything here is about arguments and output; what happens is in `render.py` and `compare.py`. Arguments are checked, and
-outputs are found to be writable, before the scene is loaded.
+Everything here is about arguments and output; what happens is in `render.py` and `compare.py`. Arguments are checked,
+and outputs are found to be writable, before the scene is loaded.
 """
 
 from __future__ import annotations
@@ -143,7 +143,9 @@ def _render_options(command: F) -> F:
 @commands.command()
 @_scene_options
 @click.option("-o", "--output", required=True, metavar="OUT.exr", help="Image and variance.")
-@click.option("--guide", help="Where the numbers come from: `none`, a guide's name, or a saved guide.  [default: realnvp]")
+@click.option(
+    "--guide", help="`none` (random numbers), a guide's name, or a saved one.  [default: realnvp]"
+)
 @_render_options
 @click.option(
     "--replay", metavar="RESULT.json", help="Repeat the recorded run, bit for bit."

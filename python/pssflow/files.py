@@ -54,6 +54,8 @@ def first_line(error: BaseException) -> str:
     in Python failed; of that only the last line tells a user something.
     """
     text = str(error).strip() or type(error).__name__
+    if text.endswith("(see above).") and error.__cause__ is not None:
+        return first_line(error.__cause__)  # Dr.Jit wraps what a renderer raised
     before, traceback, after = text.partition("Traceback (most recent call last):")
     if traceback:
         lines = [line for line in after.splitlines() if line.strip()]

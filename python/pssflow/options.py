@@ -244,9 +244,7 @@ def check_passes(replay: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
             raise ValueError(f'`replay`[{i}] = {entry!r}: expected {{"kind": …, "spp": …}}')
         kind = check_choice(f"replay[{i}].kind", entry["kind"], PASS_KINDS)
         spp = check_integer(f"replay[{i}].spp", entry["spp"], 1, MAX_SPP)
-        record = float(entry.get("record", 1.0))
-        if not 0.0 <= record <= 1.0:
-            raise ValueError(f"`replay[{i}].record` = {record}: expected a share in [0, 1]")
+        record = check_number(f"replay[{i}].record", entry.get("record", 1.0), 0.0, 1.0)
         checked.append({"kind": kind, "spp": spp, "record": record})
     return checked
 

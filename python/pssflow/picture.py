@@ -128,7 +128,7 @@ class Picture:
             if self.reference and r == 0:
                 page.panel(self.reference, 0.14, y, style)
             elif self.reference:
-                page.text(0.14, y + texts, row.note, size=10, linespacing=1.6)
+                page.text(0.14, y + texts, row.note, size=9.5, linespacing=1.6)
             for c, panel in enumerate(row.panels):
                 page.panel(panel, 0.14 + (first + c) * (wide + 0.14), y, style)
         foot_y = head + len(self.rows) * row_height

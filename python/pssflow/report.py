@@ -64,7 +64,7 @@ def runs_table(runs: Sequence[Mapping[str, Any]], title: str = "") -> Table:
 
 
 def gain(run: Mapping[str, Any], runs: Sequence[Mapping[str, Any]]) -> str:
-    """relMSE of the first run without a guide ÷ this run's; nothing where one of them is missing."""
+    """Error (relMSE) of the first run without a guide ÷ this run's; nothing where one of them is missing."""
     plain = next((r for r in runs if r["guide"] == "none"), None)
     if plain is None or plain is run or not plain["relmse"] or not run["relmse"]:
         return "" if plain is None or plain is not run else "1"
@@ -80,7 +80,8 @@ def compare_picture(
     rows = [Row(panels[i : i + PER_ROW]) for i in range(0, len(panels), PER_ROW)]
     stats = runs[0].stats
     bounces = "1 bounce" if stats["k"] == 1 else f"{stats['k']} bounces"
-    heading = f"{scene_title(scene)}: light of exactly {bounces} ({stats['parametrisation']}, {stats['emitter_strategy']})"
+    how = f"{stats['parametrisation']}, {stats['emitter_strategy']}"
+    heading = f"{scene_title(scene)}: light of exactly {bounces} ({how})"
     return Picture(heading, rows, reference_panel(truth), caption=caption)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ import pytest
 
 from tests.conftest import LLVM
 from tests.support.core import core_scene
+from tests.support.lights import LIGHTS, light
 from tests.support.values import F32, disagreements, first_rows, points, unit_interval, vector3
 
 pytestmark = pytest.mark.parity
@@ -21,97 +21,13 @@ Description = dict[str, Any]
 SAMPLES = 20_000
 
 
-def _area(**options: Any) -> Description:
-    light = {"type": "area", "radiance": {"type": "rgb", "value": [3.0, 2.0, 1.0]}}
-    return {"bsdf": {"type": "diffuse"}, "light": light} | options
-
-
-def _textured() -> Description:
-    texels = np.random.default_rng(31).uniform(0, 4, (5, 9, 3)).astype(np.float32)
-    radiance = {
-        "type": "bitmap",
-        "bitmap": mi.Bitmap(texels),
-        "raw": True,
-        "filter_type": "nearest",
-    }
-    return {"type": "area", "radiance": radiance}
-
-
-def _bumps(folder: Path) -> str:
-    """A PLY of 72 triangles with vertex normals and texture coordinates, bent so that normals differ from facets."""
-    y, x = np.mgrid[-1:1:7j, -1:1:7j]
-    z = 0.3 * np.cos(2 * x) * np.sin(1.5 * y + 0.4)
-    corner = (np.arange(6)[:, None] * 7 + np.arange(6)).ravel()[:, None]
-    faces = np.concatenate([np.add(corner, [0, 1, 8]), np.add(corner, [0, 8, 7])])
-    mesh = mi.Mesh("bumps", 49, len(faces), has_vertex_normals=True, has_vertex_texcoords=True)
-    params = mi.traverse(mesh)
-    params["vertex_positions"] = np.stack([x, y, z], -1).ravel().astype(np.float32)
-    params["vertex_texcoords"] = np.stack([x, y], -1).ravel().astype(np.float32) / 2 + 0.5
-    params["faces"] = faces.ravel().astype(np.uint32)
-    params.update()
-    mesh.write_ply(str(folder / "bumps.ply"))
-    return str(folder / "bumps.ply")
-
-
-def _shape(name: str, folder: Path) -> Description:
-    """A light away from the origin by about 3; turned, stretched, mirrored or inside out. Flat ones face the origin."""
-    T = mi.ScalarTransform4f
-    view = T().look_at(origin=[2, 1.5, 1.8], target=[0, 0.1, 0.2], up=[0.6, 0, 0.8])
-    away = T().look_at(origin=[2, 1.5, 1.8], target=[4, 3, 3], up=[0.6, 0, 0.8])
-    shapes: dict[str, Callable[[], Description]] = {
-        "rectangle": lambda: {"type": "rectangle", "to_world": view.scale([0.7, 0.4, 1])},
-        "rectangle-mirrored": lambda: {"type": "rectangle", "to_world": view.scale([-0.7, 0.4, 1])},
-        "rectangle-flipped": lambda: {
-            "type": "rectangle",
-            "to_world": away,
-            "flip_normals": True,
-        },
-        "cube": lambda: {"type": "cube", "to_world": view.scale([0.5, 0.3, 0.8])},
-        "mesh": lambda: {
-            "type": "ply",
-            "filename": _bumps(folder),
-            "to_world": view.scale([0.6, 0.8, 1.1]),
-        },
-        "mesh-flipped": lambda: {
-            "type": "ply",
-            "filename": _bumps(folder),
-            "to_world": away,
-            "flip_normals": True,
-        },
-        "mesh-facets": lambda: {
-            "type": "ply",
-            "filename": _bumps(folder),
-            "to_world": view,
-            "face_normals": True,
-        },
-        "disk": lambda: {"type": "disk", "to_world": view.scale([0.9, 0.5, 1])},
-        "disk-flipped": lambda: {"type": "disk", "to_world": away, "flip_normals": True},
-        "sphere": lambda: {"type": "sphere", "center": [2, 1, 1.5], "radius": 0.4},
-        "sphere-far": lambda: {"type": "sphere", "center": [50, 70, 20], "radius": 0.9},
-        "sphere-around": lambda: {"type": "sphere", "radius": 9.0, "flip_normals": True},
-        "sphere-turned": lambda: {"type": "sphere", "to_world": view.scale(0.6)},
-        "cylinder": lambda: {
-            "type": "cylinder",
-            "p0": [2, 1, 1],
-            "p1": [1.5, 1.8, 2],
-            "radius": 0.3,
-        },
-        "cylinder-flipped": lambda: {
-            "type": "cylinder",
-            "to_world": view.scale([2, 2, 3]),
-            "flip_normals": True,
-        },
-    }
-    return shapes[name]()
-
-
-def _scene(light: Description) -> mi.Scene:
+def _scene(lamp: Description) -> mi.Scene:
     return mi.load_dict(
         {
             "type": "scene",
             "camera": {"type": "perspective", "film": {"type": "hdrfilm", "width": 8, "height": 8}},
             "floor": {"type": "rectangle", "bsdf": {"type": "diffuse"}},
-            "light": light,
+            "lamp": lamp,
         }
     )
 
@@ -160,46 +76,38 @@ def _check(ours: dict[str, F32], theirs: dict[str, F32], *, has_point: bool = Tr
     assert np.count_nonzero(wrong) <= 5, first_rows(wrong, **rows)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        *("rectangle", "rectangle-mirrored", "rectangle-flipped", "cube"),
-        *("mesh", "mesh-flipped", "mesh-facets"),
-        *("disk", "disk-flipped", "cylinder", "cylinder-flipped"),
-        *("sphere", "sphere-far", "sphere-around", "sphere-turned"),
-    ],
-)
+@pytest.mark.parametrize("name", LIGHTS)
 def test_area_light_is_sampled_as_mitsubas(name: str, tmp_path: Path) -> None:
     mi.set_variant(LLVM)
-    scene = _scene(_shape(name, tmp_path) | _area())
+    scene = _scene(light(name, tmp_path))
     _check(*_sample(scene, *_numbers()))
 
 
 @pytest.mark.parametrize(
-    "light",
+    "lamp",
     [
         {"type": "constant", "radiance": {"type": "rgb", "value": [0.3, 0.6, 0.9]}},
         {"type": "point", "position": [1, 2, 3], "intensity": {"type": "rgb", "value": [3, 6, 9]}},
     ],
-    ids=lambda light: light["type"],
+    ids=lambda lamp: lamp["type"],
 )
-def test_light_without_surface_is_sampled_as_mitsubas(light: Description) -> None:
+def test_light_without_surface_is_sampled_as_mitsubas(lamp: Description) -> None:
     mi.set_variant(LLVM)
-    _check(*_sample(_scene(light), *_numbers()), has_point=light["type"] == "point")
+    _check(*_sample(_scene(lamp), *_numbers()), has_point=lamp["type"] == "point")
 
 
 @pytest.mark.parametrize(
     "name", ["rectangle", "disk", "sphere", "sphere-turned", "cylinder", "mesh-facets"]
 )
 def test_textured_light_shows_what_a_ray_sees(name: str, tmp_path: Path) -> None:
-    """Mitsuba draws texels by their brightness, we draw the surface: so each drawn point's radiance is compared with what
-    Mitsuba sees there along a ray, for all but 20 of 20,000 (at a texel's edge).
+    """Mitsuba draws texels by their brightness, we draw the surface: so each drawn point's radiance is compared with
+    what Mitsuba sees there along a ray, for all but 20 of 20,000 (at a texel's edge).
 
     The densities of shapes are those of `test_area_light_is_sampled_as_mitsubas`. Mitsuba's own samples are no
     reference: on a turned sphere they miss the place that they mean (its `eval_parameterization` forgets the turn).
     """
     mi.set_variant(LLVM)
-    scene = _scene(_shape(name, tmp_path) | _area(light=_textured()))
+    scene = _scene(light(name, tmp_path, textured=True))
     core, _ = core_scene(scene)
     reference, u = _numbers()
     ours = core.emitter_sample(0, reference, u)

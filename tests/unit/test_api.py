@@ -493,6 +493,10 @@ def test_what_guide_means():
         ({"spp": None, "replay": []}, "`replay` = "),
         ({"spp": None, "replay": [{"kind": "pilot"}]}, r"`replay`\[0\]"),
         ({"spp": None, "replay": [{"kind": "guess", "spp": 1}]}, r"replay\[0\].kind"),
+        (
+            {"spp": None, "replay": [{"kind": "pilot", "spp": 1, "record": 2}]},
+            r"replay\[0\].record",
+        ),
         ({"spp": None, "replay": {"k": 2}}, "lacks `passes`"),
         ({"spp": 4, "replay": [{"kind": "uniform", "spp": 1}]}, "leave out `spp`"),
     ],

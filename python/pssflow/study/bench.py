@@ -5,9 +5,9 @@ reported. Each is run once before, unmeasured: Mitsuba's LLVM variant compiles i
 
 Rays per path. Ours are counted by the tracer. Mitsuba does not count: at depth k+1 its `path` sends up to k+1
 rays to find surfaces and up to k shadow rays, fewer where a path escapes. The shares of paths that reach x₁ … x_k are
-those of our own uniform paths, drawn from the same BSDFs; shadow rays are an upper bound, since none is sent to an emitter
-that faces away. A path of Mitsuba also gathers the light of fewer bounces, ours that of exactly k: rays per second
-are comparable, paths per second only with the rays beside them.
+those of our own uniform paths, drawn from the same BSDFs; shadow rays are an upper bound, since none is sent to an
+emitter that faces away. A path of Mitsuba also gathers the light of fewer bounces, ours that of exactly k: rays per
+second are comparable, paths per second only with the rays beside them.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@
 //!                                                        └──────────► save ─► load
 //! ```
 //!
-//! Start reading at [`Guide`]; a guide is made by [`fit`], which looks its name up in [`registry`].
+//! Start reading at [`Guide`]; a guide is made by [`fit`], which looks its name up in [`registry()`].
 //! All densities are with respect to the uniform measure on the cube. This crate knows no rays, no film
 //! and no Python, reads no environment variable and draws random numbers for training only: a sample is
 //! made from the caller's uniform numbers, in place.
@@ -77,7 +77,7 @@ pub struct Header {
 /// Calls may come from several threads at once. Rows are independent: a row's result does not depend,
 /// bit for bit, on the rows beside it or on the number of threads.
 pub trait Guide: Send + Sync + std::fmt::Debug {
-    /// Name in the [`registry`].
+    /// Name in the [`registry()`].
     fn name(&self) -> &str;
 
     /// The decisions that this guide models. For any other decision `sample` leaves `u` as it is and

@@ -146,6 +146,7 @@ fn quantile(values: impl Iterator<Item = f32>, p: f64) -> Option<f32> {
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used)]
 mod tests {
     use super::*;
 

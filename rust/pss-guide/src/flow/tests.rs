@@ -1,4 +1,4 @@
-//! What holds for any weights; what holds after training is in `tests/registry.rs`.
+//! What holds for any weights; what holds after training is in `tests/guide`.
 #![allow(clippy::unwrap_used)]
 
 use pss_rng::{Purpose, Sequence, Stream};

@@ -110,7 +110,7 @@ pub(super) fn log_det_numeric(f: impl Fn(&[f64]) -> Vec<f64>, x: &[f64]) -> f64 
     for i in 0..n {
         let pivot = (i..n)
             .max_by(|&a, &b| columns[a][i].abs().total_cmp(&columns[b][i].abs()))
-            .unwrap();
+            .unwrap_or(i);
         columns.swap(i, pivot);
         log_det += columns[i][i].abs().ln();
         let row = columns[i].clone();

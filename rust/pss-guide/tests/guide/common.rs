@@ -1,5 +1,4 @@
 //! Data, fits and statistics that the tests share.
-#![allow(clippy::unwrap_used)]
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, OnceLock};

@@ -1,0 +1,7 @@
+//! What holds for every guide of the registry: a new guide is covered by its registry line.
+#![allow(clippy::unwrap_used)]
+
+mod common;
+mod density;
+mod files;
+mod input;
