@@ -111,7 +111,8 @@ class Scene:
          "replay": [{"kind": "pilot|guided|uniform", "spp": n, "record": share}, ...] or null,
          "uniform_fraction": a or null, "pilot_spp": n or null, "keep_pilot": true, "seed": 0, "threads": 0}
 
-        Returns image (h,w,3), variance (h,w,3) [variance of the mean], and "record": JSON string with
+        Returns image (h,w,3), variance (h,w,3) [variance of the mean], found and nonzero (h,w) uint32 [per pixel,
+        over all paths in the image], and "record": JSON string with
         {"chosen", "a", "k", "parametrisation", "emitter_strategy", "seed", "threads", "camera_rays", "paths_found",
          "nonzero", "nonzero_share", "outside", "non_finite", "pilot": {same counts}, "mean": [r,g,b],
          "variance": relMSE's formula with the own variance of the mean, "max_weight", "max_contribution", "ess",

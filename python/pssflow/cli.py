@@ -43,7 +43,12 @@ def _version(ctx: click.Context, _param: click.Parameter, asked: bool) -> None:
 
 @click.group("pssflow", context_settings={"help_option_names": ["-h", "--help"]})
 @click.option(
-    "--version", is_flag=True, is_eager=True, expose_value=False, callback=_version, help="Versions."
+    "--version",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_version,
+    help="Versions.",
 )
 def commands() -> None:
     """Learned importance sampling for Mitsuba 3 scenes: the light that arrives after exactly k bounces."""
@@ -69,7 +74,8 @@ def _scene_options(command: F) -> F:
                 "--sensor", type=click.IntRange(0), default=0, show_default=True, help="Its index."
             ),
             click.option(
-                "--variant", help="Mitsuba variant.  [default: llvm_ad_rgb, or scalar_rgb without LLVM]"
+                "--variant",
+                help="Mitsuba variant.  [default: llvm_ad_rgb, or scalar_rgb without LLVM]",
             ),
         )
     ):
@@ -92,9 +98,7 @@ def _render_options(command: F) -> F:
                 type=Positive("number of seconds"),
                 help="Seconds instead: pilot, training and rendering; loading comes before.",
             ),
-            click.option(
-                "--k", type=click.IntRange(1, 32), help="Bounces.  [default: 2]"
-            ),
+            click.option("--k", type=click.IntRange(1, 32), help="Bounces.  [default: 2]"),
             click.option(
                 "--parametrisation",
                 type=click.Choice(PARAMETRISATIONS),
@@ -119,9 +123,7 @@ def _render_options(command: F) -> F:
                 help="Whether the pilot enters the image.  [default: keep]",
             ),
             click.option("--seed", type=click.IntRange(0, 2**64 - 1), help="[default: 0]"),
-            click.option(
-                "--threads", type=click.IntRange(1, 4096), help="[default: one a core]"
-            ),
+            click.option("--threads", type=click.IntRange(1, 4096), help="[default: one a core]"),
             click.option(
                 "--preset", type=click.Choice(tuple(PRESETS)), help="Settings of the source thesis."
             ),
@@ -147,9 +149,7 @@ def _render_options(command: F) -> F:
     "--guide", help="`none` (random numbers), a guide's name, or a saved one.  [default: realnvp]"
 )
 @_render_options
-@click.option(
-    "--replay", metavar="RESULT.json", help="Repeat the recorded run, bit for bit."
-)
+@click.option("--replay", metavar="RESULT.json", help="Repeat the recorded run, bit for bit.")
 @click.option("--save-guide", metavar="FILE", help="Save what was learned.")
 @click.option("--load-guide", metavar="FILE", help="Use a saved guide; no pilot is spent.")
 @click.pass_obj
@@ -401,9 +401,7 @@ def _arguments(options: Mapping[str, Any]) -> dict[str, Any]:
     return {to: options[name] for to, name in names.items() if options[name] is not None}
 
 
-def _settings(
-    options: Mapping[str, Any], guides: Sequence[str]
-) -> dict[str, dict[str, Any]]:
+def _settings(options: Mapping[str, Any], guides: Sequence[str]) -> dict[str, dict[str, Any]]:
     """Options of each guide, by guide. Unknown guides and options without their guide are refused before any work."""
     from .guide import choose
 

@@ -73,11 +73,14 @@ class Comparison:
             write_json(image.with_suffix(".json"), run.stats)
             written += [image, image.with_suffix(".json")]
         self.truth.write(folder / "reference.exr")
-        compare_picture(
-            self.scene.name, self.runs, self.truth, self.reference_line()
-        ).draw(folder / "comparison.png")
+        compare_picture(self.scene.name, self.runs, self.truth, self.reference_line()).draw(
+            folder / "comparison.png"
+        )
         write_json(folder / "results.json", self.record())
-        return [*written, *(folder / n for n in ("reference.exr", "comparison.png", "results.json"))]
+        return [
+            *written,
+            *(folder / n for n in ("reference.exr", "comparison.png", "results.json")),
+        ]
 
 
 def compare(

@@ -42,7 +42,7 @@ from numpy.typing import ArrayLike, NDArray
 from . import _core
 from .options import check_integer
 
-__all__ = ["ForeignGuide", "Guide", "guide_names", "registry"]
+__all__ = ["Choice", "ForeignGuide", "Guide", "choose", "guide_names", "is_path", "registry"]
 
 F32 = NDArray[np.float32]
 
@@ -266,7 +266,7 @@ def choose(guide: Any, options: Mapping[str, Any]) -> Choice:
     if isinstance(guide, Guide):
         _no_options(options, "a guide that is fitted already")
         return Choice(guide.name, "ready", learns=False, options={}, given=guide)
-    if isinstance(guide, os.PathLike) or (isinstance(guide, str) and _is_path(guide)):
+    if isinstance(guide, os.PathLike) or (isinstance(guide, str) and is_path(guide)):
         _no_options(options, "a guide that is fitted already")
         path = Path(guide)
         if not path.is_file():
@@ -286,6 +286,13 @@ def choose(guide: Any, options: Mapping[str, Any]) -> Choice:
         )
     _no_options(options, "an object of your own; set them there")
     return Choice(type(guide).__name__, "foreign", learns=True, options={}, given=guide)
+
+
+def is_path(guide: str) -> bool:
+    """Whether a text is a saved guide's path rather than a name; a file that is called as a guide needs its `./`."""
+    if set(guide.split("+")) <= {*guide_names()}:
+        return False
+    return os.sep in guide or guide.endswith(".safetensors") or Path(guide).is_file()
 
 
 def options_json(options: Mapping[str, Any]) -> str:
@@ -329,10 +336,6 @@ def _named(guide: str, options: Mapping[str, Any]) -> Choice:
         for part in owners:
             by_part[part][option] = value
     return Choice(guide, guide, learns=True, options=by_part[guide] if len(parts) == 1 else by_part)
-
-
-def _is_path(guide: str) -> bool:
-    return os.sep in guide or guide.endswith(".safetensors") or Path(guide).is_file()
 
 
 def _known() -> str:

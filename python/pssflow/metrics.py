@@ -70,8 +70,8 @@ def relmse(
         ValueError: shapes differ, or a value is not finite.
 
     Examples:
-        >>> relmse([[[1.1, 0.9, 1.0]]], [[[1.0, 1.0, 1.0]]]) * 3 * 1.01
-        0.0200...
+        >>> round(relmse([[[1.1, 0.9, 1.0]]], [[[1.0, 1.0, 1.0]]]) * 3 * 1.01, 6)
+        0.02
     """
     return _mean_of_worst_removed(_pixels(image, reference, reference_variance), 0.0)
 

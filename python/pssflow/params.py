@@ -22,9 +22,7 @@ class Size(click.ParamType):
             return value
         match = re.fullmatch(r"(\d{1,6})[xX×](\d{1,6})", str(value))
         if not match:
-            self.fail(
-                f"{value!r} is no film size; expected WIDTHxHEIGHT, as 640x480", param, ctx
-            )
+            self.fail(f"{value!r} is no film size; expected WIDTHxHEIGHT, as 640x480", param, ctx)
         return int(match[1]), int(match[2])
 
 

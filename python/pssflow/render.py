@@ -37,6 +37,10 @@ class Result:
     """k-bounce radiance of the crop, (H, W, 3), W·sr⁻¹·m⁻², linear sRGB."""
     variance: F32
     """Variance of each mean, (H, W, 3), estimated from the same samples."""
+    found: NDArray[np.uint32]
+    """Paths through each pixel whose vertices x₁ … x_k all exist, (H, W)."""
+    nonzero: NDArray[np.uint32]
+    """Paths through each pixel that carry light, (H, W)."""
     stats: dict[str, Any]
     """The run as one JSON object, what the command's `--json` prints: counts, weights, passes, seconds."""
     timings: dict[str, float]
@@ -200,7 +204,8 @@ def run(scene: Scene, choice: Choice, plan: Plan, progress: Progress = True) -> 
         "version": _core.__version__,
         "variant": scene.variant,
     }
-    return Result(output["image"], output["variance"], stats, timings, used)
+    images = {key: output[key] for key in ("image", "variance", "found", "nonzero")}
+    return Result(**images, stats=stats, timings=timings, guide=used)
 
 
 def _replayed(

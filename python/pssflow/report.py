@@ -71,9 +71,7 @@ def gain(run: Mapping[str, Any], runs: Sequence[Mapping[str, Any]]) -> str:
     return f"{plain['relmse'] / run['relmse']:.2f}"
 
 
-def compare_picture(
-    scene: str, runs: Sequence[Result], truth: Reference, caption: str
-) -> Picture:
+def compare_picture(scene: str, runs: Sequence[Result], truth: Reference, caption: str) -> Picture:
     """The reference and all runs, a few to a row."""
     records = [run.stats for run in runs]
     panels = [panel(run, truth, gain=gain(run.stats, records)) for run in runs]
@@ -127,9 +125,7 @@ def scene_info(record: Mapping[str, Any]) -> list[Any]:
     guides.add_column("what it is; options and defaults for --set")
     guides.add_row("none", "random numbers")
     for name, guide in record["guides"].items():
-        options = ", ".join(
-            f"{key}={_option(value)}" for key, value in guide["options"].items()
-        )
+        options = ", ".join(f"{key}={_option(value)}" for key, value in guide["options"].items())
         guides.add_row(name, f"{guide['summary']}\n{options}")
     refused = [f"not supported: {line}" for line in record["unsupported"]]
     return [found, *(refused or ["Everything in it is supported."]), guides]

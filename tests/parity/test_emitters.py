@@ -96,15 +96,12 @@ def test_light_without_surface_is_sampled_as_mitsubas(lamp: Description) -> None
     _check(*_sample(_scene(lamp), *_numbers()), has_point=lamp["type"] == "point")
 
 
-@pytest.mark.parametrize(
-    "name", ["rectangle", "disk", "sphere", "sphere-turned", "cylinder", "mesh-facets"]
-)
+@pytest.mark.parametrize("name", LIGHTS)
 def test_textured_light_shows_what_a_ray_sees(name: str, tmp_path: Path) -> None:
-    """Mitsuba draws texels by their brightness, we draw the surface: so each drawn point's radiance is compared with
-    what Mitsuba sees there along a ray, for all but 20 of 20,000 (at a texel's edge).
+    """Mitsuba draws texels by their brightness, we draw the surface, with the densities tested above.
 
-    The densities of shapes are those of `test_area_light_is_sampled_as_mitsubas`. Mitsuba's own samples are no
-    reference: on a turned sphere they miss the place that they mean (its `eval_parameterization` forgets the turn).
+    So the radiance of each point drawn is compared with what Mitsuba sees there along a ray; all but 20 of 20,000
+    agree, those at a texel's edge.
     """
     mi.set_variant(LLVM)
     scene = _scene(light(name, tmp_path, textured=True))

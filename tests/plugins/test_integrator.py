@@ -1,4 +1,4 @@
-"""`<integrator type="pssflow">`: in both variants, registered again on each change, and rendering the scene as it is."""
+"""`<integrator type="pssflow">`: in both variants, after changes of the variant, and of the scene as it is now."""
 
 from __future__ import annotations
 
@@ -74,6 +74,28 @@ def test_from_xml(variant, tmp_path):
     text = str(scene.integrator())
     assert text.startswith("PssflowIntegrator[")
     assert "epochs = 1" in text
+
+
+def test_a_saved_guide_lies_beside_the_scene(scalar_variant, tmp_path):
+    (tmp_path / "scene.xml").write_text(XML)
+    learned = pssflow.render(tmp_path / "scene.xml", "realnvp", 4, k=1, epochs=1, progress=False)
+    assert isinstance(learned.guide, pssflow.Guide)
+    learned.guide.save(tmp_path / "guide.safetensors")
+    ready = XML.replace('"realnvp"', '"guide.safetensors"')
+    ready = ready.replace('<integer name="realnvp_epochs" value="1"/>', "")
+    (tmp_path / "ready.xml").write_text(ready)
+    scene = mi.load_file(str(tmp_path / "ready.xml"))
+    image(scene, spp=4)
+    stats = scene.integrator().result.stats
+    assert stats["chosen"] == "realnvp"
+    assert [entry["kind"] for entry in stats["passes"]] == ["guided"]
+
+
+def test_beside_a_scene_that_has_another_integrator(variant):
+    scene = mi.load_dict(scenes.furnace_sphere() | {"integrator": {"type": "path"}})
+    integrator: Any = mi.load_dict({"type": "pssflow", "guide": "none"})
+    rendered = image(scene, integrator=integrator, spp=2)
+    np.testing.assert_array_equal(rendered, integrator.result.image)
 
 
 def test_it_survives_changes_of_the_variant():
@@ -208,7 +230,8 @@ EDITS: dict[str, tuple[str, Any, Any]] = {
 def test_an_edited_scene_renders_its_new_state(variant, edit):
     """The image changes, and is that of a scene that was loaded with the new value."""
     # Mitsuba merges objects that are alike on loading, and then knows them by other names.
-    description = scenes.furnace_sphere() | {"integrator": {"type": "pssflow", "guide": "none"}}
+    description: dict[str, Any] = scenes.furnace_sphere()
+    description["integrator"] = {"type": "pssflow", "guide": "none"}
     scene = mi.load_dict(description, optimize=False)
     before = image(scene, spp=8)
 

@@ -117,6 +117,9 @@ def test_a_result_is_complete(variant, guide):
     assert stats["camera_rays"] + stats["pilot"]["camera_rays"] == 4 * 32 * 48
     assert stats["budget"] == ("4 spp" if guide == "none" else "4 spp, pilot inside")
     assert stats["mean"] == pytest.approx(result.image.mean(axis=(0, 1)).tolist(), rel=1e-4)
+    for name, counted in (("paths_found", result.found), ("nonzero", result.nonzero)):
+        assert counted.shape == (32, 48)
+        assert counted.sum() == stats[name] + stats["pilot"][name]
     if guide == "none":
         assert result.guide is None
     else:
@@ -545,11 +548,9 @@ def test_scenes_that_are_none(scalar_variant, tmp_path):
         quick(tmp_path)
     with pytest.raises(TypeError, match="`scene` is a int"):
         quick(3)
-    with pytest.raises(ValueError, match="scene dictionary: .*klein-bottle"):
+    with pytest.raises(ValueError, match=r"scene dictionary: .*klein-bottle"):
         quick({"type": "scene", "shape": {"type": "klein-bottle"}})
-    with pytest.raises(
-        pssflow.UnsupportedError, match="ellipsoids|bsplinecurve|heightfield|sdfgrid|instance"
-    ):
+    with pytest.raises(pssflow.UnsupportedError, match='"instance"'):
         quick(
             {
                 "type": "scene",
@@ -570,6 +571,6 @@ def test_records_that_are_none(tmp_path):
 
 
 def test_a_plan_speaks_json():
-    plan = Plan.make(learns=True, spp=8, seed=2**64 - 1, uniform_fraction=np.float32(0.5))
+    plan = Plan.make(learns=True, spp=8, seed=2**64 - 1, uniform_fraction=0.5)
     options = json.loads(plan.core("realnvp", {}, "mis"))
     assert (options["spp"], options["seed"], options["uniform_fraction"]) == (8, 2**64 - 1, 0.5)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -12,6 +13,7 @@ import pssflow
 from pssflow import reference as module
 from pssflow.reference import Reference, default_cache, read_exr, reference
 from tests import scenes
+from tests.support.runs import truth_runs
 
 
 @pytest.fixture(autouse=True)
@@ -20,7 +22,7 @@ def _small_passes(monkeypatch):
     monkeypatch.setattr(module, "PATHS_PER_PASS", 8 * 32 * 32)
 
 
-def render(cache, **options) -> Reference:
+def render(cache: Any, **options: Any) -> Reference:
     """The furnace at k = 2, quietly."""
     options = {"seconds": 0.0, "progress": False, "cache": cache} | options
     return reference(mi.load_dict(scenes.furnace_sphere()), **options)
@@ -34,21 +36,7 @@ def test_a_reference_is_the_mean_over_passes(llvm_variant, tmp_path):
     assert found.image.dtype == found.variance.dtype == np.float32
 
     scene = mi.load_dict(scenes.furnace_sphere())
-    images = []
-    for seed in range(found.passes):
-        deep, shallow = (
-            np.array(
-                mi.render(
-                    scene,
-                    integrator=mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": 9}),  # pyright: ignore[reportArgumentType]
-                    seed=seed,  # pyright: ignore[reportArgumentType]
-                    spp=8,
-                ),
-                np.float64,
-            )
-            for depth in (3, 2)
-        )
-        images.append(deep - shallow)
+    images = truth_runs(scene, k=2, seeds=range(found.passes), spp=8).astype(np.float64)
     np.testing.assert_allclose(found.image, np.mean(images, 0), atol=1e-5)
     np.testing.assert_allclose(
         found.variance, np.var(images, 0, ddof=1) / found.passes, rtol=1e-2, atol=1e-6
@@ -92,7 +80,7 @@ def test_a_second_call_renders_nothing(llvm_variant, tmp_path, monkeypatch):
     np.testing.assert_array_equal(second.image, first.image)
     np.testing.assert_array_equal(second.variance, first.variance)
     assert "4 of 4 passes from the cache" in second.note
-    assert [file.name for file in tmp_path.iterdir()] == [second.path.name]
+    assert list(tmp_path.iterdir()) == [second.path]
 
 
 def test_it_is_resumed(llvm_variant, tmp_path):
@@ -137,6 +125,7 @@ def test_the_scene_is_left_as_it_was(variant, tmp_path):
 
 def test_a_damaged_file_is_rendered_anew(llvm_variant, tmp_path):
     path = render(tmp_path).path
+    assert path is not None
     path.write_bytes(path.read_bytes()[:1000])
     again = render(tmp_path)
     assert "was damaged" in again.note
@@ -212,7 +201,9 @@ def test_a_folder_that_cannot_be_written(llvm_variant, tmp_path):
 def test_the_default_folder(monkeypatch, llvm_variant, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert default_cache() == tmp_path / "pssflow" / "references"
-    assert render(None).path.parent == default_cache()
+    kept = render(None).path
+    assert kept is not None
+    assert kept.parent == default_cache()
     monkeypatch.delenv("XDG_CACHE_HOME")
     assert default_cache() == Path.home() / ".cache" / "pssflow" / "references"
     # Where the default cannot be written, the work goes on.

@@ -118,6 +118,10 @@ def define() -> Callable[[Any], Any]:
         def __init__(self, props: Any) -> None:
             _without_warning(super().__init__, props)
             guide = str(props.get("guide", "realnvp"))
+            if guides.is_path(guide):
+                # As every file that a scene names: relative to the scene's own folder.
+                resolver: Any = mi.file_resolver
+                guide = str(resolver().resolve(guide))
             self.choice = guides.choose(guide, _guide_options(props, guide))
             given = {name: props.get(name) for name in PARAMETERS if name in props}
             self.arguments: dict[str, Any] = given

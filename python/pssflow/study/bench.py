@@ -3,7 +3,7 @@
 All contestants take turns within a round, so that a busy machine slows all of them; medians over the rounds are
 reported. Each is run once before, unmeasured: Mitsuba's LLVM variant compiles its kernel then.
 
-Rays per path. Ours are counted by the tracer. Mitsuba does not count: at depth k+1 its `path` sends up to k+1
+Rays per path. Ours are counted by the tracer (for `nee` less the BSDF rays of `mis`). Mitsuba does not count: at depth k+1 its `path` sends up to k+1
 rays to find surfaces and up to k shadow rays, fewer where a path escapes. The shares of paths that reach x₁ … x_k are
 those of our own uniform paths, drawn from the same BSDFs; shadow rays are an upper bound, since none is sent to an
 emitter that faces away. A path of Mitsuba also gathers the light of fewer bounces, ours that of exactly k: rays per
@@ -36,6 +36,10 @@ SCENES = ("cornell-box", "teapot")
 SCALAR, LLVM = "scalar_rgb", "llvm_ad_rgb"
 
 
+SIGNS = {"counted": "", "about": "≈ ", "upper bound": "≤ "}
+"""What stands before rays per path that are not counted."""
+
+
 @dataclass
 class Contestant:
     """Something that traces `paths` paths when it is called."""
@@ -45,13 +49,15 @@ class Contestant:
     paths: int
     rays_per_path: float
     counted: str
-    """Where `rays_per_path` comes from."""
+    """How well `rays_per_path` is known: a key of `SIGNS`."""
 
 
 @click.command("bench")
 @click.option("-o", "--output", default="out", show_default=True, help="Folder for bench.json.")
 @click.option("--scenes", "folder", default="scenes", show_default=True, help="Folder of scenes.")
-@click.option("--spp", default=16, show_default=True, type=click.IntRange(1), help="Samples a pixel.")
+@click.option(
+    "--spp", default=16, show_default=True, type=click.IntRange(1), help="Samples a pixel."
+)
 @click.option("--rounds", default=5, show_default=True, type=click.IntRange(1))
 @click.option("--scale", default=1.0, show_default=True, help="Factor on the film's size.")
 @click.option("-k", "--bounces", "k", default=2, show_default=True, type=click.IntRange(1, 32))
@@ -123,15 +129,15 @@ def contestants(path: Path, spp: int, k: int, threads: int, scale: float) -> lis
                 progress=False,
             ),
             paths,
-            # `rays_alone` sends those of NEE; MIS adds the ray from x_k that looks for an emitter.
-            alone["rays_per_path"] + (reach[-1] if strategy == "mis" else 0.0),
-            "counted",
+            # `rays_alone` sends those of MIS; NEE spares the ray from x_k that looks for an emitter.
+            alone["rays_per_path"] - (reach[-1] if strategy == "nee" else 0.0),
+            "counted" if strategy == "mis" else "about",
         )
         for strategy in ("mis", "nee")
     ]
     found.append(
         Contestant(
-            "its rays alone",
+            "mis, its rays alone",
             lambda: scene.core.rays_alone(spp=spp, k=k, threads=threads),
             paths,
             alone["rays_per_path"],
@@ -187,13 +193,12 @@ def table(name: str, rows: list[dict[str, Any]]) -> Table:
     for i, row in enumerate(rows):
         times = row["seconds"]
         spread = (max(times) - min(times)) / statistics.median(times)
-        bound = "≤ " if row["rays"] != "counted" else ""
         shown.add_row(
             row["contestant"],
             str(row["threads"]),
             f"{row['paths_per_second'] / 1e6:.2f}",
             f"{row['us_per_path']:.3f}",
-            f"{bound}{row['rays_per_path']:.2f}",
+            f"{SIGNS[row['rays']]}{row['rays_per_path']:.2f}",
             f"{1 / row['mrays_per_second']:.3f}",
             f"±{50 * spread:.0f} %",
             end_section=i + 1 < len(rows) and rows[i + 1]["threads"] != row["threads"],
@@ -203,9 +208,7 @@ def table(name: str, rows: list[dict[str, Any]]) -> Table:
 
 def _reached(scene: Scene, bounces: int) -> float:
     """Share of uniform paths that have the vertices x₁ … x_bounces."""
-    stats = scene.render(
-        "none", 4, k=bounces, emitter_strategy="nee", seed=1, progress=False
-    ).stats
+    stats = scene.render("none", 4, k=bounces, emitter_strategy="nee", seed=1, progress=False).stats
     return stats["paths_found"] / stats["camera_rays"]
 
 

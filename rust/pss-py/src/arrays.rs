@@ -90,6 +90,15 @@ pub(crate) fn to_matrix(py: Python<'_>, data: Vec<f32>, width: usize) -> PyResul
         .unbind())
 }
 
+/// Counts as (n, width).
+pub(crate) fn to_counts(py: Python<'_>, data: Vec<u32>, width: usize) -> PyResult<Py<PyAny>> {
+    let rows = data.len() / width.max(1);
+    Ok(PyArray1::from_vec(py, data)
+        .reshape([rows, width])?
+        .into_any()
+        .unbind())
+}
+
 /// (n, a, b) out.
 pub(crate) fn to_cube(py: Python<'_>, data: Vec<f32>, shape: [usize; 3]) -> PyResult<Py<PyAny>> {
     let array: Bound<'_, PyArray3<f32>> = PyArray1::from_vec(py, data).reshape(shape)?;

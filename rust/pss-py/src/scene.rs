@@ -272,8 +272,11 @@ impl Scene {
             (None, _, _) => None,
         };
         dict.set_item("guide", guide)?;
-        dict.set_item("image", arrays::to_cube(py, outcome.image, shape)?)?;
-        dict.set_item("variance", arrays::to_cube(py, outcome.variance, shape)?)?;
+        let film = outcome.film;
+        dict.set_item("image", arrays::to_cube(py, film.image, shape)?)?;
+        dict.set_item("variance", arrays::to_cube(py, film.variance, shape)?)?;
+        dict.set_item("found", arrays::to_counts(py, film.found, shape[1])?)?;
+        dict.set_item("nonzero", arrays::to_counts(py, film.nonzero, shape[1])?)?;
         Ok(dict)
     }
 

@@ -160,6 +160,21 @@ struct Sums {
 pub struct Accumulator {
     tile: Tile,
     sums: Vec<Sums>,
+    /// Per pixel, whatever the filter: its own paths found and its own paths that carry light.
+    counts: Vec<[u32; 2]>,
+}
+
+/// What the sums come to; rows from the top.
+#[derive(Clone, Debug)]
+pub struct Developed {
+    /// (height, width, 3): mean radiance.
+    pub image: Vec<f32>,
+    /// (height, width, 3): variance of that mean.
+    pub variance: Vec<f32>,
+    /// (height, width): paths through the pixel whose vertices x₁ … x_k all exist.
+    pub found: Vec<u32>,
+    /// (height, width): paths through the pixel that carry light.
+    pub nonzero: Vec<u32>,
 }
 
 impl Accumulator {
@@ -175,9 +190,11 @@ impl Accumulator {
             width: right - x,
             height: bottom - y,
         };
+        let pixels = tile.width as usize * tile.height as usize;
         Self {
             tile,
-            sums: vec![Sums::default(); tile.width as usize * tile.height as usize],
+            sums: vec![Sums::default(); pixels],
+            counts: vec![[0; 2]; pixels],
         }
     }
 
@@ -195,9 +212,13 @@ impl Accumulator {
         )
     }
 
-    /// Adds a sample at a film position (pixels from the crop's corner).
+    /// Adds a path at a film position (pixels from the crop's corner): its estimate, and whether it found
+    /// all its vertices.
     #[inline]
-    pub fn add(&mut self, film: &Film, position: [f32; 2], value: Rgb) {
+    pub fn add(&mut self, film: &Film, position: [f32; 2], value: Rgb, found: bool) {
+        let own = self.index(position[0] as u32, position[1] as u32);
+        self.counts[own][0] += u32::from(found);
+        self.counts[own][1] += u32::from(value != Rgb::ZERO);
         match &film.filter {
             None => self.splat(position[0] as u32, position[1] as u32, 1.0, value),
             Some(filter) => {
@@ -227,11 +248,19 @@ impl Accumulator {
         }
     }
 
+    /// Where a pixel lies in the sums; one outside (rounding at the very edge) counts as the nearest inside.
+    #[inline]
+    fn index(&self, x: u32, y: u32) -> usize {
+        let t = self.tile;
+        let x = x.clamp(t.x, t.x + t.width - 1) - t.x;
+        let y = y.clamp(t.y, t.y + t.height - 1) - t.y;
+        y as usize * t.width as usize + x as usize
+    }
+
     #[inline]
     fn splat(&mut self, x: u32, y: u32, w: f32, value: Rgb) {
-        let x = x.clamp(self.tile.x, self.tile.x + self.tile.width - 1) - self.tile.x;
-        let y = y.clamp(self.tile.y, self.tile.y + self.tile.height - 1) - self.tile.y;
-        let s = &mut self.sums[(y * self.tile.width + x) as usize];
+        let index = self.index(x, y);
+        let s = &mut self.sums[index];
         let w = f64::from(w);
         s.weight += w;
         s.weight_2 += w * w;
@@ -247,12 +276,15 @@ impl Accumulator {
 
     /// Adds another accumulator's sums; where they overlap, in the caller's order.
     pub fn merge(&mut self, other: &Self) {
-        let (a, b) = (self.tile, other.tile);
+        let b = other.tile;
         for row in 0..b.height {
             for column in 0..b.width {
-                let (x, y) = (b.x + column - a.x, b.y + row - a.y);
-                let to = &mut self.sums[(y * a.width + x) as usize];
-                let from = &other.sums[(row * b.width + column) as usize];
+                let i = self.index(b.x + column, b.y + row);
+                let j = (row * b.width + column) as usize;
+                for c in 0..2 {
+                    self.counts[i][c] += other.counts[j][c];
+                }
+                let (to, from) = (&mut self.sums[i], &other.sums[j]);
                 to.weight += from.weight;
                 to.weight_2 += from.weight_2;
                 for c in 0..3 {
@@ -264,8 +296,8 @@ impl Accumulator {
         }
     }
 
-    /// The image: per pixel and channel the mean and the variance of the mean, rows from the top.
-    pub fn develop(&self) -> (Vec<f32>, Vec<f32>) {
+    /// Mean, variance of the mean, and counts.
+    pub fn develop(&self) -> Developed {
         let mut image = Vec::with_capacity(3 * self.sums.len());
         let mut variance = Vec::with_capacity(3 * self.sums.len());
         for s in &self.sums {
@@ -288,6 +320,11 @@ impl Accumulator {
                 variance.push(var as f32);
             }
         }
-        (image, variance)
+        Developed {
+            image,
+            variance,
+            found: self.counts.iter().map(|c| c[0]).collect(),
+            nonzero: self.counts.iter().map(|c| c[1]).collect(),
+        }
     }
 }

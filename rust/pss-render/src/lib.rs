@@ -27,7 +27,7 @@ pub use columns::{Columns, Decision, EmitterStrategy};
 pub use description::{Array, SCHEMA};
 pub use distribution::Discrete;
 pub use error::{SceneError, TraceError};
-pub use film::{Accumulator, Film, Tile};
+pub use film::{Accumulator, Developed, Film, Tile};
 pub use interaction::Interaction;
 pub use path::{NumberSource, Parametrisation, Paths, Tracer, Uniform, VertexContext};
 pub use scene::{Scene, Summary};

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use pss_guide::{Guide, GuideError, Records};
-use pss_render::{Accumulator, Scene, Tracer};
+use pss_render::{Accumulator, Developed, Scene, Tracer};
 use serde::Serialize;
 
 use crate::error::RenderError;
@@ -32,10 +32,8 @@ pub struct Outcome {
     pub width: u32,
     /// Rows.
     pub height: u32,
-    /// Radiance (height, width, 3), W·sr⁻¹·m⁻².
-    pub image: Vec<f32>,
-    /// Variance of each mean, the same shape.
-    pub variance: Vec<f32>,
+    /// Radiance (W·sr⁻¹·m⁻²), its variance, and counts per pixel of all paths in the image.
+    pub film: Developed,
     /// The guide that was used; `None` for random numbers.
     pub guide: Option<Arc<dyn Guide>>,
     /// Its name, or `none`.
@@ -62,25 +60,27 @@ impl Outcome {
     /// Mean radiance over the image.
     pub fn mean(&self) -> [f64; 3] {
         let mut mean = [0.0; 3];
-        for pixel in self.image.chunks_exact(3) {
+        for pixel in self.film.image.chunks_exact(3) {
             for c in 0..3 {
                 mean[c] += f64::from(pixel[c]);
             }
         }
-        mean.map(|sum| sum / (self.image.len() / 3) as f64)
+        mean.map(|sum| sum / (self.film.image.len() / 3) as f64)
     }
 
     /// The estimate's own variance in the measure of relMSE: mean over pixels and channels of
     /// var ÷ (mean² + ε), ε = (0.1 · image mean)². `None` for a black image or one sample a pixel.
     pub fn relative_variance(&self) -> Option<f64> {
-        let mean = self.image.iter().map(|&x| f64::from(x)).sum::<f64>() / self.image.len() as f64;
+        let mean = self.film.image.iter().map(|&x| f64::from(x)).sum::<f64>()
+            / self.film.image.len() as f64;
         let epsilon = (0.1 * mean).powi(2);
         let terms = self
+            .film
             .image
             .iter()
-            .zip(&self.variance)
+            .zip(&self.film.variance)
             .map(|(&x, &v)| f64::from(v) / (f64::from(x).powi(2) + epsilon));
-        let variance = terms.sum::<f64>() / self.image.len() as f64;
+        let variance = terms.sum::<f64>() / self.film.image.len() as f64;
         variance.is_finite().then_some(variance)
     }
 }
@@ -428,7 +428,7 @@ impl Run<'_> {
 
     fn finish(mut self, guide: Option<Arc<dyn Guide>>) -> Outcome {
         let [width, height] = self.context.tracer.scene().film().crop_size();
-        let (image, variance) = self.image.develop();
+        let film = self.image.develop();
         let mut all = self.pilot;
         all.add(&self.rendered);
         if all.counts.non_finite > 0 {
@@ -450,8 +450,7 @@ impl Run<'_> {
         Outcome {
             width,
             height,
-            image,
-            variance,
+            film,
             chosen: guide
                 .as_ref()
                 .map_or_else(|| "none".to_owned(), |g| g.name().to_owned()),

@@ -272,7 +272,9 @@ impl PassContext<'_> {
                 piece.result.statistics.counts.non_finite += 1;
                 estimate = pss_render::math::Rgb::ZERO;
             }
-            piece.sums.add(film, paths.film[i], estimate);
+            piece
+                .sums
+                .add(film, paths.film[i], estimate, paths.found[i]);
             let f = paths.f(i);
             if f == pss_render::math::Rgb::ZERO {
                 continue;
