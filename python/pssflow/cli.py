@@ -29,6 +29,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return run_command(commands, arguments)
 
 
+RECORDED = (
+    *("--guide", "--load-guide", "--preset", "--spp", "--time", "--pilot-spp", "--keep-pilot"),
+    *("--k", "--parametrisation", "--emitter-strategy", "--uniform-fraction", "--seed", "--set"),
+)
+"""What a record says itself, and cannot be given beside `--replay`."""
+
+
 def _version(ctx: click.Context, _param: click.Parameter, asked: bool) -> None:
     """The versions that a bug report needs."""
     if not asked or ctx.resilient_parsing:
@@ -172,22 +179,10 @@ def render(
     from .output import write_json
 
     terminal.quiet = quiet
-    for first, second in (
-        ("--guide", "--load-guide"),
-        ("--replay", "--load-guide"),
-        ("--replay", "--guide"),
-        ("--replay", "--spp"),
-        ("--replay", "--time"),
-        ("--replay", "--preset"),
-        ("--replay", "--k"),
-        ("--replay", "--parametrisation"),
-        ("--replay", "--emitter-strategy"),
-        ("--replay", "--uniform-fraction"),
-        ("--replay", "--seed"),
-        ("--replay", "--set"),
-    ):
-        given = options | {"guide": guide, "replay": replay, "load_guide": load_guide}
-        _exclude(given, first, second)
+    given = options | {"guide": guide, "replay": replay, "load_guide": load_guide}
+    _exclude(given, "--guide", "--load-guide")
+    for other in RECORDED:
+        _exclude(given, "--replay", other)
     _exclude(options, "--spp", "--time")
     target = _exr(output)
     record_target = target.with_suffix(".json")
@@ -343,13 +338,17 @@ def _exclude(options: Mapping[str, Any], first: str, second: str) -> None:
 
 
 def _set_variant(name: str | None, notes: list[str]) -> None:
-    """Sets Mitsuba's variant, the best that works here if none is asked for."""
+    """Sets Mitsuba's variant, the best that works here if none is asked for, and silences Mitsuba's own warnings.
+
+    Those come in colour, with a date, from sources that nobody here has; what matters of them, the export says itself.
+    """
     import mitsuba as mi
 
     from .variants import VARIANTS, ensure_variant, llvm_problem
 
     if name is None:
         notice = ensure_variant()
+        mi.set_log_level(mi.LogLevel.Error)
         if notice:
             notes.append(notice)
         return
@@ -361,6 +360,7 @@ def _set_variant(name: str | None, notes: list[str]) -> None:
     if problem:
         raise RuntimeError(f"--variant {name}: {problem}")
     mi.set_variant(name)
+    mi.set_log_level(mi.LogLevel.Error)
 
 
 def _load(terminal: Terminal, options: Mapping[str, Any]) -> Any:

@@ -58,7 +58,8 @@ class ForeignGuide(Protocol):
 
     Arrays are float32. `save(path)` and `load(path)` are for its owner: pssflow does not call them. The estimate is
     unbiased for whatever density the object has, provided that `sample` and `log_prob` agree with each other (tests of
-    one's own guide belong there) and a > 0; at a = 0 also q > 0 is needed wherever f > 0.
+    one's own guide belong there) and a > 0; at a = 0 also q > 0 is needed wherever f > 0. Methods are called from
+    another thread, one call at a time; Ctrl-C waits for the call under way.
     """
 
     def fit(self, u: F32, f: F32, g: F32, zeros: int, seed: int) -> None:

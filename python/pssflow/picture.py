@@ -209,7 +209,7 @@ class _Page:
         """One image with its title, insets and map."""
         from matplotlib.patches import Rectangle
 
-        self.text(x, y, panel.title, size=10.5, weight="bold")
+        self.text(x, y, panel.title, size=10, weight="bold")
         self.text(x, y + 0.22, "\n".join(panel.lines), size=8.5, color=MUTED)
         shown = display(panel.image, style.exposure)
         y += self.texts

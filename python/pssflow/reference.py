@@ -33,6 +33,7 @@ from .files import first_line, write_beside
 from .options import MAX_BOUNCES, check_integer, check_number
 from .progress import Progress, reporting
 from .scene import Scene, SceneLike, load_scene
+from .variants import quiet
 
 __all__ = ["Reference", "cache_path", "default_cache", "read_exr", "reference"]
 
@@ -289,7 +290,8 @@ class _Renderer:
         """The image (H, W, 3), samples that the sampler made of `spp`, and values that were not finite."""
         # A scalar sampler's streams part ways at the last bounce, so that one seed for both would buy nothing.
         seeds = (seed, seed) if self.jit else (2 * seed, 2 * seed + 1)
-        with dr.suspend_grad():
+        # Its warnings are of Ctrl-C, which is answered elsewhere, and of values that are counted here.
+        with dr.suspend_grad(), quiet():
             deep = self._image(self.deep, seeds[0], spp)
             shallow = self._image(self.shallow, seeds[1], spp)
         image = deep - shallow

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import drjit as dr
 import mitsuba as mi
 
 from .export import VARIANTS
 
-__all__ = ["VARIANTS", "ensure_variant", "is_supported", "llvm_problem"]
+__all__ = ["VARIANTS", "ensure_variant", "is_supported", "llvm_problem", "quiet"]
 
 OLDEST_LLVM = 16
 """LLVM 15, as Debian 12 has it, aborts the process on Dr.Jit's code ("Cannot select: fminimum")."""
@@ -42,3 +45,14 @@ def llvm_problem() -> str | None:
             f"libLLVM {found} is too old for Dr.Jit: install libllvm19, or set DRJIT_LIBLLVM_PATH"
         )
     return None
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Keeps back Mitsuba's warnings for a while; errors are raised as ever. Not for several threads at once."""
+    level = mi.log_level()
+    mi.set_log_level(mi.LogLevel.Error)
+    try:
+        yield
+    finally:
+        mi.set_log_level(level)

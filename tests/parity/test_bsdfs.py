@@ -145,7 +145,7 @@ class Gallery(NamedTuple):
     """All BSDFs in one scene, on both sides."""
 
     core: _core.Scene
-    index: dict[str, int]
+    ids: dict[str, int]
     """BSDF of the core, by name."""
     theirs: dict[str, mi.BSDF]
 
@@ -174,7 +174,7 @@ def test_value_and_density_are_mitsubas(name: str, gallery: Gallery) -> None:
     n = 20_000
     uv = rng.uniform(-1, 2, (n, 2)).astype(np.float32)
     wi, wo = direction_pairs(rng, n)
-    value, pdf = gallery.core.bsdf_eval_pdf(gallery.index[name], uv, wi, wo)
+    value, pdf = gallery.core.bsdf_eval_pdf(gallery.ids[name], uv, wi, wo)
 
     si = interaction(uv, wi)
     theirs, context = gallery.theirs[name], mi.BSDFContext()
@@ -204,7 +204,7 @@ INCIDENT = {
 
 
 def _directed(name: str, n: int) -> F32:
-    w = np.float32(INCIDENT[name])
+    w = np.array(INCIDENT[name], np.float32)
     return np.tile(w / np.linalg.norm(w), (n, 1)).astype(np.float32)
 
 
@@ -219,7 +219,7 @@ def test_samples_follow_the_density(name: str, incident: str, gallery: Gallery) 
     n = 200_000
     wi = _directed(incident, n)
     uv = np.full((n, 2), (0.31, 0.62), np.float32)
-    bsdf = gallery.index[name]
+    bsdf = gallery.ids[name]
     wo, weight, pdf = gallery.core.bsdf_sample(bsdf, uv, wi, unit_interval(rng, n, 2))
     drawn = pdf > 0
 
@@ -251,11 +251,11 @@ def test_samples_have_mitsubas_mean_weight(name: str, gallery: Gallery) -> None:
     uv = rng.uniform(-1, 2, (n, 2)).astype(np.float32)
     wi = sphere_directions(rng, n)
     u = unit_interval(rng, n, 3)
-    _, ours, _ = gallery.core.bsdf_sample(gallery.index[name], uv, wi, u[:, :2].copy())
+    _, ours, _ = gallery.core.bsdf_sample(gallery.ids[name], uv, wi, u[:, :2].copy())
     _, theirs = gallery.theirs[name].sample(
         mi.BSDFContext(),
         interaction(uv, wi),
-        mi.Float(u[:, 2].copy()),
+        u[:, 2].copy(),
         mi.Point2f(u[:, :2].T.copy()),
     )
     difference = ours.astype(np.float64) - points(theirs)
@@ -269,11 +269,9 @@ def test_no_bsdf_makes_energy(name: str, gallery: Gallery) -> None:
     rng = np.random.default_rng(14)
     n = 50_000
     for cos_theta in (1.0, 0.7, 0.3, 0.05):
-        wi = np.tile(np.float32([np.sqrt(1 - cos_theta**2), 0, cos_theta]), (n, 1))
+        wi = np.tile(np.array([np.sqrt(1 - cos_theta**2), 0, cos_theta], np.float32), (n, 1))
         uv = rng.random((n, 2)).astype(np.float32)
-        _, weight, _ = gallery.core.bsdf_sample(
-            gallery.index[name], uv, wi, unit_interval(rng, n, 2)
-        )
+        _, weight, _ = gallery.core.bsdf_sample(gallery.ids[name], uv, wi, unit_interval(rng, n, 2))
         mean = weight.mean(axis=0, dtype=np.float64)
         se = weight.std(axis=0, dtype=np.float64) / np.sqrt(n)
         assert (mean <= 1 + 4 * se + 1e-4).all(), f"cos θ = {cos_theta}: {mean} ± {se}"

@@ -55,14 +55,14 @@ def _sample(scene: mi.Scene, reference: F32, u: F32) -> tuple[dict[str, F32], di
     theirs["radiance"] = points(weight) * theirs["pdf"][:, None]
     lit = theirs["radiance"].max(axis=1) > 0
     for side in (ours, theirs):
-        side["lit"] = (side["pdf"] > 0) & (side["radiance"].max(axis=1) > 0)
+        side["lit"] = np.logical_and(side["pdf"] > 0, side["radiance"].max(axis=1) > 0)
     assert np.array_equal(theirs["lit"], lit)
     return ours, theirs
 
 
 def _check(ours: dict[str, F32], theirs: dict[str, F32], *, has_point: bool = True) -> None:
     """All but 5 in 20,000 lit rows agree: those lie at a light's very edge, or where it is seen edge-on."""
-    lit = ours["lit"] & theirs["lit"]
+    lit = np.logical_and(ours["lit"], theirs["lit"])
     assert np.count_nonzero(lit) > 1000
     wrong = ours["lit"] != theirs["lit"]
     wrong |= lit & disagreements(ours["d"], theirs["d"], rel=2e-4, floor=1.0)

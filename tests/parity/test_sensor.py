@@ -98,7 +98,7 @@ def test_rays_are_mitsubas(name: str) -> None:
 
     pixels = _film_positions(width, height)
     origins, directions = core.film_ray(pixels)
-    position = mi.Point2f((pixels / np.float32([width, height])).T.copy())
+    position = mi.Point2f((pixels / np.array([width, height], np.float32)).T.copy())
     ray, _ = sensor.sample_ray(mi.Float(0), mi.Float(0.5), position, mi.Point2f(0.5, 0.5))
     np.testing.assert_allclose(origins, points(ray.o), atol=1e-5)
     np.testing.assert_allclose(directions, points(ray.d), atol=2e-6)

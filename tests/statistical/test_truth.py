@@ -228,7 +228,7 @@ def test_learned_numbers_give_mitsubas_mean(
     assert r.has_power, r.explain(artifacts)
 
 
-@pytest.mark.parametrize("strategy", ["mis", "nee"])
+@pytest.mark.parametrize("strategy", ["mis", pytest.param("nee", marks=pytest.mark.long)])
 def test_the_mixture_alone_gives_mitsubas_mean(strategy: str, artifacts: Path) -> None:
     """H0: as above without the pilot in the image, whose uniform paths would water a bias down by a quarter."""
     options = {"guide": "realnvp", "guide_options": LEARNED, "uniform_fraction": 0.1}
@@ -238,7 +238,7 @@ def test_the_mixture_alone_gives_mitsubas_mean(strategy: str, artifacts: Path) -
     assert r.has_power, r.explain(artifacts)
 
 
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("name", [pytest.param("cornell-box", marks=pytest.mark.long), "teapot"])
 def test_the_thesis_own_estimate_is_put_on_record(name: str, record_property) -> None:
     """The flow alone, a = 0: its density has no lower bound. Its mean is recorded, not asserted: paths that it hardly
     ever draws are missing from any finite image, and weigh without limit when they come.

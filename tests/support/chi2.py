@@ -25,8 +25,8 @@ def sphere_chi2(
     phi_edges = np.linspace(-np.pi, np.pi, sectors + 1)
     expected = drawn * _integrals(pdf, z_edges, phi_edges)
     integral = expected.sum() / drawn
-    samples = samples.astype(np.float64)
-    z, phi = np.clip(samples[:, 2], -1, 1), np.arctan2(samples[:, 1], samples[:, 0])
+    w = samples.astype(np.float64)
+    z, phi = np.clip(w[:, 2], -1, 1), np.arctan2(w[:, 1], w[:, 0])
     observed, *_ = np.histogram2d(z, phi, bins=(z_edges, phi_edges))
 
     observed = np.append(observed.ravel(), drawn - len(samples))

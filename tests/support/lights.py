@@ -22,9 +22,9 @@ LIGHTS = (
 MISSED_BY_MITSUBA = ("rectangle-flipped", "cube", "mesh", "mesh-flipped", "sphere-turned")
 """Lights whose radiance Mitsuba 3.9 samples wrongly where it is textured, so that its images are no truth there.
 
-It draws a texel and looks for its place by uv: a flipped rectangle then faces the wrong way, a cube has six places, on a
-turned sphere the place is found as if it were not turned, and interpolated normals count on one side only. What a ray
-sees of these lights is right, and ours is compared with that.
+It draws a texel and looks for its place by uv: a flipped rectangle then faces the wrong way, a cube has six places, a
+sphere forgets that it is turned, and interpolated normals count on one side only. What a ray sees
+of these lights is right, and ours is compared with that.
 """
 
 

@@ -58,7 +58,7 @@ def direction_pairs(rng: np.random.Generator, n: int) -> tuple[F32, F32]:
     for w in (wi, wo):
         w[: n - quarter, 2] = np.abs(w[: n - quarter, 2])
     spread = rng.choice([0.01, 0.05, 0.2], quarter)[:, None].astype(np.float32)
-    mirrored = wi[half : half + quarter] * np.float32([-1, -1, 1])
+    mirrored = wi[half : half + quarter] * np.array([-1, -1, 1], np.float32)
     mirrored = mirrored + spread * rng.normal(size=(quarter, 3)).astype(np.float32)
     wo[half : half + quarter] = mirrored / np.linalg.norm(mirrored, axis=1, keepdims=True)
     # And some on the back, for BSDFs with two sides.
@@ -74,10 +74,10 @@ def disagreements(ours: F32, theirs: F32, *, rel: float, floor: float) -> NDArra
     """
     ours, theirs = (np.atleast_2d(v.T).T.astype(np.float64) for v in (ours, theirs))
     wrong = ~(np.abs(ours - theirs) <= rel * np.maximum(np.abs(theirs), floor))
-    return wrong.any(axis=1)
+    return np.asarray(wrong.any(axis=1))
 
 
-def first_rows(wrong: NDArray[np.bool_], **columns: F32) -> str:
+def first_rows(wrong: NDArray[np.bool_], **columns: NDArray[Any]) -> str:
     """The first few disagreeing rows in words, for an assertion's message."""
     rows = np.flatnonzero(wrong)
     lines = [f"{len(rows)} of {len(wrong)} rows disagree"]

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -161,7 +162,7 @@ def holm(p: F64) -> F64:
     return corrected.reshape(p.shape)
 
 
-def write_exr(path: Path, values: F64) -> None:
+def write_exr(path: Path, values: NDArray[Any]) -> None:
     """Writes (height, width) as a grey float32 EXR; without a Mitsuba variant, as .npy beside that name."""
     import mitsuba as mi
 
@@ -190,10 +191,8 @@ def tile_means(runs: F64, tile: int) -> F64:
     _, height, width = runs.shape
     rows, columns = np.arange(0, height, tile), np.arange(0, width, tile)
     sums = np.add.reduceat(np.add.reduceat(runs, rows, axis=1), columns, axis=2)
-    heights, widths = (
-        np.diff(np.append(edges, end)) for edges, end in ((rows, height), (columns, width))
-    )
-    return sums / (heights[:, None] * widths)
+    heights = np.diff(rows, append=height)[:, None]
+    return sums / (heights * np.diff(columns, append=width))
 
 
 def _heaviest(runs: F64) -> float:

@@ -82,15 +82,18 @@ keeps the last ``pssflow.Result``: variance, statistics, the guide.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
 from .. import guide as guides
+from ..export.walk import is_scalar
 from ..options import DEFAULT_SPP, Plan
 from ..render import Result, run
 from ..scene import Scene
+from ..variants import quiet
 
 __all__ = ["define"]
 
@@ -116,7 +119,10 @@ def define() -> Callable[[Any], Any]:
         """See the module."""
 
         def __init__(self, props: Any) -> None:
-            _without_warning(super().__init__, props)
+            # Scalar variants warn that integrators in Python are slow; this one runs in Rust. JIT variants do not
+            # warn, and construct plugins in several threads.
+            with quiet() if is_scalar() else nullcontext():
+                super().__init__(props)
             guide = str(props.get("guide", "realnvp"))
             if guides.is_path(guide):
                 # As every file that a scene names: relative to the scene's own folder.
@@ -215,16 +221,3 @@ def _fill(film: Any, image: Any) -> None:
 def _scalar(seed: Any) -> int:
     """A seed, which JIT variants may pass as an array of one."""
     return int(seed) if isinstance(seed, int) else int(np.asarray(seed).ravel()[0])
-
-
-def _without_warning(construct: Callable[[Any], None], props: Any) -> None:
-    """Keeps back Mitsuba's warning that integrators in Python are slow in scalar variants: this one runs in Rust."""
-    if not (mi.variant() or "").startswith("scalar"):
-        construct(props)
-        return
-    level = mi.log_level()
-    mi.set_log_level(mi.LogLevel.Error)
-    try:
-        construct(props)
-    finally:
-        mi.set_log_level(level)

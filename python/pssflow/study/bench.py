@@ -3,11 +3,11 @@
 All contestants take turns within a round, so that a busy machine slows all of them; medians over the rounds are
 reported. Each is run once before, unmeasured: Mitsuba's LLVM variant compiles its kernel then.
 
-Rays per path. Ours are counted by the tracer (for `nee` less the BSDF rays of `mis`). Mitsuba does not count: at depth k+1 its `path` sends up to k+1
-rays to find surfaces and up to k shadow rays, fewer where a path escapes. The shares of paths that reach x₁ … x_k are
-those of our own uniform paths, drawn from the same BSDFs; shadow rays are an upper bound, since none is sent to an
-emitter that faces away. A path of Mitsuba also gathers the light of fewer bounces, ours that of exactly k: rays per
-second are comparable, paths per second only with the rays beside them.
+Rays per path. Ours are counted by the tracer (for `nee` less the BSDF rays of `mis`). Mitsuba does not count: at
+depth k+1 its `path` sends up to k+1 rays to find surfaces and up to k shadow rays, fewer where a path escapes. The
+shares of paths that reach x₁ … x_k are those of our own uniform paths, drawn from the same BSDFs; shadow rays are an
+upper bound, since none is sent to an emitter that faces away. A path of Mitsuba also gathers the light of fewer
+bounces, ours that of exactly k: rays per second are comparable, paths per second only with the rays beside them.
 """
 
 from __future__ import annotations
@@ -78,14 +78,16 @@ def bench(
     if problem:
         console.print(f"without {LLVM}: {problem}")
     rows = []
-    for name in SCENES:
-        contests = {
-            threads: contestants(Path(folder) / name / "scene.xml", spp, k, threads, scale)
-            for threads in (1, 2)
-        }
-        measured = measure(contests, rounds)
-        rows += [row | {"scene": name} for row in measured]
-        console.print(table(name, measured))
+    thread_count = dr.thread_count()
+    try:
+        for name in SCENES:
+            path = Path(folder) / name / "scene.xml"
+            contests = {n: contestants(path, spp, k, n, scale) for n in (1, 2)}
+            measured = measure(contests, rounds)
+            rows += [row | {"scene": name} for row in measured]
+            console.print(table(name, measured))
+    finally:
+        dr.set_thread_count(thread_count)
     after = os.getloadavg()
     console.print(f"load average {after[0]:.2f} (1 min) at the end")
     console.print(
@@ -160,7 +162,7 @@ def measure(contests: dict[int, list[Contestant]], rounds: int) -> list[dict[str
                 start = time.perf_counter()
                 result = contestant.run()
                 elapsed = time.perf_counter() - start
-                if isinstance(result, dict):  # rays_alone times its queries itself
+                if isinstance(result, dict):  # it left its preparations out of the time
                     elapsed = result["seconds"]
                 if measured >= 0:
                     seconds.setdefault((threads, contestant.name), []).append(elapsed)
@@ -220,12 +222,14 @@ def _mitsuba(
     scene = Scene(path, scale=scale).mi_scene
     integrator = mi.load_dict({"type": "path", "max_depth": k + 1, "rr_depth": k + 2})
 
-    def run() -> None:
+    def run() -> dict[str, float]:
         mi.set_variant(variant)
         dr.set_thread_count(threads)
+        start = time.perf_counter()
         image = integrator.render(scene, seed=0, spp=spp)
         dr.eval(image)
         dr.sync_thread()
+        return {"seconds": time.perf_counter() - start}
 
     return run
 
