@@ -39,7 +39,9 @@ class Guide:
     ) -> Guide:
         """Fits guide `name` to numbers `u` (n, d) with contributions `f` (n,) drawn from density `g` (n,)."""
     @staticmethod
-    def load(path: str, columns_hash: str | None = None, scene_hash: str | None = None) -> Guide: ...
+    def load(
+        path: str, columns_hash: str | None = None, scene_hash: str | None = None
+    ) -> Guide: ...
     def save(self, path: str, columns_hash: str, scene_hash: str) -> None: ...
     def sample(self, n: int, seed: int = 0) -> tuple[F32, F32]:
         """Draws (n, d) numbers and their log-density (n,); -inf is never returned for a drawn row."""
@@ -60,7 +62,11 @@ class Scene:
     """A scene that can be traced, built from `pssflow.export`."""
 
     def __init__(
-        self, description: str, arrays: Sequence[NDArray[Any]], search_dirs: Sequence[str] = (), threads: int = 0
+        self,
+        description: str,
+        arrays: Sequence[NDArray[Any]],
+        search_dirs: Sequence[str] = (),
+        threads: int = 0,
     ) -> None: ...
     @property
     def hash(self) -> str: ...
@@ -88,13 +94,20 @@ class Scene:
         emitter_strategy: str,
         threads: int = 0,
     ) -> dict[str, NDArray[Any]]:
-        """u (n, 2k+1 or 2k+3), pixels (n, 2) film positions in pixels from the crop's corner.
+        """Columns u (n, 2k+1 or 2k+3), pixels (n, 2) film positions in pixels from the crop's corner.
 
         Returns f (n,3), f_nee (n,3), f_bsdf (n,3), found (n,) bool, position/normal/outgoing (n,k,3),
         pixel (n,2) in [0,1)², emitter (n,) uint32.
         """
     def pilot(
-        self, *, spp: int, k: int, parametrisation: str, emitter_strategy: str, seed: int = 0, threads: int = 0
+        self,
+        *,
+        spp: int,
+        k: int,
+        parametrisation: str,
+        emitter_strategy: str,
+        seed: int = 0,
+        threads: int = 0,
     ) -> dict[str, NDArray[Any]]:
         """All uniform paths of `spp` samples a pixel: u (n,2k+1 or 2k+3), pixels (n,2), g (n,), and trace's keys."""
     def render(
@@ -125,10 +138,10 @@ class Scene:
     def bsdf_eval_pdf(self, bsdf: int, uv: F32, wi: F32, wo: F32) -> tuple[F32, F32]:
         """Local directions (z = normal): value·cos (n,3) and pdf (n,)."""
     def bsdf_sample(self, bsdf: int, uv: F32, wi: F32, u: F32) -> tuple[F32, F32, F32]:
-        """wo (n,3), weight (n,3), pdf (n,); pdf 0 where nothing was sampled."""
+        """Returns wo (n,3), weight (n,3), pdf (n,); pdf 0 where nothing was sampled."""
     def texture_eval(self, texture: int, uv: F32) -> F32: ...
     def emitter_sample(self, emitter: int, reference: F32, u: F32) -> dict[str, NDArray[Any]]:
-        """d (n,3), radiance (n,3), pdf (n,) (0: none), p (n,3)."""
+        """Returns d (n,3), radiance (n,3), pdf (n,) (0: none), p (n,3)."""
     def film_ray(self, pixels: F32) -> tuple[F32, F32]:
         """Origins and directions of camera rays through film positions."""
     def rays_alone(self, *, spp: int, k: int, threads: int = 0) -> dict[str, float]:
