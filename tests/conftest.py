@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import mitsuba as mi
@@ -43,8 +45,26 @@ def shared_scenes() -> Path:
     return Path(folder)
 
 
+def _folder(request: pytest.FixtureRequest, kind: str) -> Path:
+    """A test's own folder below `out/tests`."""
+    name = re.sub(r"[^\w.-]+", "-", request.node.name).strip("-")
+    return ROOT / "out" / "tests" / kind / Path(request.node.path).stem / name
+
+
 @pytest.fixture
 def artifacts(request: pytest.FixtureRequest) -> Path:
-    """Where a failing test leaves its pictures: `out/tests/artifacts/<test>`. Made by who writes there."""
-    name = re.sub(r"[^\w.-]+", "-", request.node.name).strip("-")
-    return ROOT / "out" / "tests" / "artifacts" / Path(request.node.path).stem / name
+    """Where a failing test leaves its pictures: `out/tests/artifacts/<file>/<test>`. Made by who writes there."""
+    return _folder(request, "artifacts")
+
+
+@pytest.fixture
+def record(request: pytest.FixtureRequest) -> Iterator[dict[str, float]]:
+    """Numbers to keep whether the test passes or not: `out/tests/records/<file>/<test>.json`.
+
+    Not pytest's `record_property`, which the JUnit format of `make test` does not take.
+    """
+    numbers: dict[str, float] = {}
+    yield numbers
+    folder = _folder(request, "records")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    folder.with_name(folder.name + ".json").write_text(json.dumps(numbers), encoding="utf-8")

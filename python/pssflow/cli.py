@@ -216,7 +216,8 @@ def render(
     if as_json:
         terminal.json(result.stats)
     else:
-        terminal.out.print(report.runs_table([result.stats], title=_headline(scene, result.stats)))
+        terminal.out.print(_headline(scene, result.stats), highlight=False, soft_wrap=True)
+        terminal.out.print(report.runs_table([result.stats]))
         terminal.out.print(f"wrote {target} and {record_target}", highlight=False, soft_wrap=True)
 
 
@@ -278,8 +279,9 @@ def compare(
     if as_json:
         terminal.json(comparison.record())
     else:
-        title = _headline(scene, comparison.runs[0].stats)
-        terminal.out.print(report.runs_table(comparison.records(), title=title))
+        headline = _headline(scene, comparison.runs[0].stats)
+        terminal.out.print(headline, highlight=False, soft_wrap=True)
+        terminal.out.print(report.runs_table(comparison.records()))
         terminal.out.print(comparison.reference_line(), highlight=False, soft_wrap=True)
         names = ", ".join(path.name for path in written)
         terminal.out.print(f"wrote {folder}: {names}", highlight=False, soft_wrap=True)

@@ -31,9 +31,9 @@ PER_ROW = 4
 """Runs side by side in a picture, beside the reference."""
 
 
-def runs_table(runs: Sequence[Mapping[str, Any]], title: str = "") -> Table:
+def runs_table(runs: Sequence[Mapping[str, Any]]) -> Table:
     """One row a run; columns that no run can fill are left out."""
-    shown = Table(title=title, title_justify="left", title_style="bold")
+    shown = Table()
     measured = any(run["relmse"] is not None for run in runs)
     shown.add_column("guide")
     shown.add_column("budget")
@@ -104,7 +104,7 @@ def reference_panel(truth: Reference) -> Panel:
     name = "Mitsuba’s path" if truth.k is not None else "reference"
     lines = [f"depth {truth.k + 1} − depth {truth.k}"] if truth.k is not None else []
     if truth.spp:
-        lines.append(f"{truth.spp:,} spp each, {truth.seconds:.0f} s".replace(",", " "))
+        lines.append(f"{count(truth.spp)} spp each, {truth.seconds:.0f} s")
     if truth.variance.any():
         lines.append(f"relative standard error {number(truth.standard_error, 2)}")
     return Panel(name, np.maximum(truth.image, 0.0), lines)
@@ -112,7 +112,7 @@ def reference_panel(truth: Reference) -> Panel:
 
 def scene_info(record: Mapping[str, Any]) -> list[Any]:
     """What `pssflow info` prints: tables, and lines of text."""
-    found = Table(title=record["scene"], title_justify="left", title_style="bold")
+    found = Table()
     found.add_column("kind")
     found.add_column("understood")
     for kind, plugins in record["counts"].items():
@@ -120,15 +120,15 @@ def scene_info(record: Mapping[str, Any]) -> list[Any]:
             found.add_row(kind, ", ".join(f"{n} {name}" for name, n in plugins.items()))
     found.add_row("triangles", count(record["triangles"]))
     found.add_row("arrays", f"{record['array_bytes'] / 2**20:.1f} MiB")
-    guides = Table(title="guides", title_justify="left", title_style="bold")
-    guides.add_column("name")
+    guides = Table()
+    guides.add_column("guide")
     guides.add_column("what it is; options and defaults for --set")
     guides.add_row("none", "random numbers")
     for name, guide in record["guides"].items():
         options = ", ".join(f"{key}={_option(value)}" for key, value in guide["options"].items())
         guides.add_row(name, f"{guide['summary']}\n{options}")
     refused = [f"not supported: {line}" for line in record["unsupported"]]
-    return [found, *(refused or ["Everything in it is supported."]), guides]
+    return [record["scene"], found, *(refused or ["Everything in it is supported."]), guides]
 
 
 def scene_title(name: str) -> str:

@@ -84,13 +84,12 @@ def _cases() -> list[Any]:
 
 @pytest.mark.parametrize(("name", "k", "parametrisation", "strategy"), _cases())
 def test_random_numbers_give_mitsubas_mean(
-    name: str, k: int, parametrisation: str, strategy: str, artifacts: Path, record_property
+    name: str, k: int, parametrisation: str, strategy: str, artifacts: Path, record
 ) -> None:
     """H0: `none` and the truth have equal means. 16 seeds × 32 spp each."""
     options = {"k": k, "parametrisation": parametrisation, "emitter_strategy": strategy}
     r = welch(_truth(name, k), _ours(name, **options))
-    record_property("p", r.p)
-    record_property("largest sample's share", max(r.heaviest))
+    record |= {"p": r.p, "largest sample's share": max(r.heaviest)}
     assert r.p > ALPHA / 2, r.explain(artifacts)
     assert r.has_power or strategy == "nee", r.explain(artifacts)
 
@@ -215,7 +214,7 @@ def _learned_cases() -> list[Any]:
 
 @pytest.mark.parametrize(("name", "guide", "a", "parametrisation"), _learned_cases())
 def test_learned_numbers_give_mitsubas_mean(
-    name: str, guide: str, a: float, parametrisation: str, artifacts: Path, record_property
+    name: str, guide: str, a: float, parametrisation: str, artifacts: Path, record
 ) -> None:
     """H0: a flow in the mixture has the truth as mean, its pilot kept: each of 16 seeds learns a flow of its own.
 
@@ -223,7 +222,7 @@ def test_learned_numbers_give_mitsubas_mean(
     """
     options = {"guide": guide, "guide_options": LEARNED, "uniform_fraction": a, "pilot_spp": 8}
     r = welch(_truth(name, 2), _ours(name, parametrisation=parametrisation, **options))
-    record_property("p", r.p)
+    record["p"] = r.p
     assert r.p > ALPHA / 2, r.explain(artifacts)
     assert r.has_power, r.explain(artifacts)
 
@@ -239,7 +238,7 @@ def test_the_mixture_alone_gives_mitsubas_mean(strategy: str, artifacts: Path) -
 
 
 @pytest.mark.parametrize("name", [pytest.param("cornell-box", marks=pytest.mark.long), "teapot"])
-def test_the_thesis_own_estimate_is_put_on_record(name: str, record_property) -> None:
+def test_the_thesis_own_estimate_is_put_on_record(name: str, record) -> None:
     """The flow alone, a = 0: its density has no lower bound. Its mean is recorded, not asserted: paths that it hardly
     ever draws are missing from any finite image, and weigh without limit when they come.
 
@@ -252,10 +251,10 @@ def test_the_thesis_own_estimate_is_put_on_record(name: str, record_property) ->
     runs = np.stack([result["image"] for result in results])
     assert np.isfinite(runs).all()
     r = welch(_truth(name, 2), runs)
-    record_property("mean ÷ truth", float(r.images[1].mean / r.images[0].mean))
-    record_property("p", r.p)
-    record_property("largest weight", max(result["record"]["max_weight"] for result in results))
-    for record in (result["record"] for result in results):
-        assert record["outside"] > 0
-        assert record["paths_found"] + record["outside"] <= record["camera_rays"]
-        assert record["nonzero"] <= record["paths_found"]
+    record["mean ÷ truth"] = float(r.images[1].mean / r.images[0].mean)
+    record["p"] = r.p
+    record["largest weight"] = max(result["record"]["max_weight"] for result in results)
+    for counts in (result["record"] for result in results):
+        assert counts["outside"] > 0
+        assert counts["paths_found"] + counts["outside"] <= counts["camera_rays"]
+        assert counts["nonzero"] <= counts["paths_found"]

@@ -4,9 +4,28 @@
 //! box filter that is the mean of the pixel's own samples. Beside it the variance of that mean:
 //! Σ w²(v − pixel)² / (Σ w)², with Bessel's correction for equal weights.
 
+use serde::Deserialize;
+
 use crate::error::SceneError;
 use crate::math::Rgb;
-use crate::sensor::FilmDescription;
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Description {
+    pub(crate) size: [u32; 2],
+    pub(crate) crop_offset: [u32; 2],
+    pub(crate) crop_size: [u32; 2],
+    pub(crate) rfilter: FilterDescription,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct FilterDescription {
+    #[serde(rename = "type")]
+    pub(crate) name: String,
+    pub(crate) radius: f32,
+    pub(crate) table: Vec<f32>,
+}
 
 /// Size, crop and reconstruction filter.
 #[derive(Clone, Debug)]
@@ -37,10 +56,26 @@ impl Filter {
         let i = (t as usize).min(self.table.len() - 2);
         self.table[i] + (self.table[i + 1] - self.table[i]) * (t - i as f32)
     }
+
+    /// The weights of all columns within `start .. start + n` that a sample at `x` reaches; returns the first.
+    #[inline]
+    fn weights(&self, x: f32, start: u32, n: u32, weights: &mut Vec<f32>) -> u32 {
+        let first = (x - 0.5 - self.radius).ceil().max(start as f32) as u32;
+        let last = (x - 0.5 + self.radius)
+            .floor()
+            .min((start + n) as f32 - 1.0);
+        weights.clear();
+        let mut column = first;
+        while column as f32 <= last {
+            weights.push(self.eval(column as f32 + 0.5 - x));
+            column += 1;
+        }
+        first
+    }
 }
 
 impl Film {
-    pub(crate) fn build(d: FilmDescription) -> Result<Self, SceneError> {
+    pub(crate) fn build(d: Description) -> Result<Self, SceneError> {
         let value = |name: &'static str, value: f64, rule: &'static str| SceneError::Value {
             owner: "film".to_owned(),
             name,
@@ -162,6 +197,8 @@ pub struct Accumulator {
     sums: Vec<Sums>,
     /// Per pixel, whatever the filter: its own paths found and its own paths that carry light.
     counts: Vec<[u32; 2]>,
+    /// Scratch: a sample's weights by column.
+    columns: Vec<f32>,
 }
 
 /// What the sums come to; rows from the top.
@@ -195,6 +232,7 @@ impl Accumulator {
             tile,
             sums: vec![Sums::default(); pixels],
             counts: vec![[0; 2]; pixels],
+            columns: Vec::new(),
         }
     }
 
@@ -219,33 +257,30 @@ impl Accumulator {
         let own = self.index(position[0] as u32, position[1] as u32);
         self.counts[own][0] += u32::from(found);
         self.counts[own][1] += u32::from(value != Rgb::ZERO);
-        match &film.filter {
-            None => self.splat(position[0] as u32, position[1] as u32, 1.0, value),
-            Some(filter) => {
-                let range = |x: f32, start: u32, n: u32| {
-                    let first = (x - 0.5 - filter.radius).ceil().max(start as f32) as u32;
-                    let last = (x - 0.5 + filter.radius)
-                        .floor()
-                        .min((start + n) as f32 - 1.0);
-                    (first, last)
-                };
-                let (x0, x1) = range(position[0], self.tile.x, self.tile.width);
-                let (y0, y1) = range(position[1], self.tile.y, self.tile.height);
-                let mut y = y0;
-                while y as f32 <= y1 {
-                    let wy = filter.eval(y as f32 + 0.5 - position[1]);
-                    let mut x = x0;
-                    while x as f32 <= x1 {
-                        let w = wy * filter.eval(x as f32 + 0.5 - position[0]);
-                        if w != 0.0 {
-                            self.splat(x, y, w, value);
-                        }
-                        x += 1;
-                    }
-                    y += 1;
+        let Some(filter) = &film.filter else {
+            return self.splat(own, 1.0, value);
+        };
+        // Separable: one weight a column and one a row.
+        let mut columns = std::mem::take(&mut self.columns);
+        let t = self.tile;
+        let x0 = filter.weights(position[0], t.x, t.width, &mut columns);
+        let y0 = (position[1] - 0.5 - filter.radius).ceil().max(t.y as f32) as u32;
+        let y1 = (position[1] - 0.5 + filter.radius)
+            .floor()
+            .min((t.y + t.height) as f32 - 1.0);
+        let mut y = y0;
+        while y as f32 <= y1 {
+            let wy = filter.eval(y as f32 + 0.5 - position[1]);
+            let row = self.index(x0, y);
+            for (i, wx) in columns.iter().enumerate() {
+                let w = wx * wy;
+                if w != 0.0 {
+                    self.splat(row + i, w, value);
                 }
             }
+            y += 1;
         }
+        self.columns = columns;
     }
 
     /// Where a pixel lies in the sums; one outside (rounding at the very edge) counts as the nearest inside.
@@ -258,8 +293,7 @@ impl Accumulator {
     }
 
     #[inline]
-    fn splat(&mut self, x: u32, y: u32, w: f32, value: Rgb) {
-        let index = self.index(x, y);
+    fn splat(&mut self, index: usize, w: f32, value: Rgb) {
         let s = &mut self.sums[index];
         let w = f64::from(w);
         s.weight += w;

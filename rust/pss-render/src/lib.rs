@@ -4,9 +4,10 @@
 //! scene that came from Mitsuba through [`Scene::new`]. Start reading at [`path`], which is the main loop;
 //! [`columns`] says what each number decides.
 //!
-//! Deliberately absent: learning (a guide is seen only as a [`path::NumberSource`]), Python, files, random
+//! Deliberately absent: learning (a guide is seen only as a [`NumberSource`]), Python, files, random
 //! numbers, and the division by a density.
 
+mod arrays;
 pub mod bsdf;
 pub mod columns;
 mod description;
@@ -16,19 +17,24 @@ mod error;
 pub mod film;
 mod interaction;
 pub mod math;
+pub mod numbers;
 pub mod path;
+pub mod paths;
 mod scene;
 mod sensor;
 pub mod shape;
 pub mod texture;
 mod warp;
 
+pub use arrays::Array;
 pub use columns::{Columns, Decision, EmitterStrategy};
-pub use description::{Array, SCHEMA};
+pub use description::SCHEMA;
 pub use distribution::Discrete;
 pub use error::{SceneError, TraceError};
 pub use film::{Accumulator, Developed, Film, Tile};
 pub use interaction::Interaction;
-pub use path::{NumberSource, Parametrisation, Paths, Tracer, Uniform, VertexContext};
+pub use numbers::{NumberSource, Uniform, VertexContext};
+pub use path::{Parametrisation, Tracer};
+pub use paths::Paths;
 pub use scene::{Scene, Summary};
 pub use sensor::Sensor;

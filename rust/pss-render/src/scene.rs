@@ -3,9 +3,10 @@
 use embree4::{Device, Hit, Ray};
 use serde::Deserialize;
 
+use crate::arrays::{Array, Arrays, check, check_index};
 use crate::bsdf::{Bsdf, Materials};
 use crate::columns::EmitterStrategy;
-use crate::description::{Array, Arrays, SCHEMA, SceneDescription, check, check_index, scene_hash};
+use crate::description::{SCHEMA, SceneDescription, scene_hash};
 use crate::distribution::Discrete;
 use crate::emitter::{self, Emitter};
 use crate::error::SceneError;

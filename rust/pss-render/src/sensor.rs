@@ -4,7 +4,7 @@ use embree4::Ray;
 use glam::Affine3A;
 use serde::Deserialize;
 
-use crate::description::{check, check_all_finite};
+use crate::arrays::{check, check_all_finite};
 use crate::error::SceneError;
 use crate::film::Film;
 use crate::math::Vec3;
@@ -24,24 +24,6 @@ pub(crate) struct PerspectiveDescription {
     near_clip: f32,
     far_clip: f32,
     principal_point_offset: [f32; 2],
-}
-
-#[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(crate) struct FilmDescription {
-    pub(crate) size: [u32; 2],
-    pub(crate) crop_offset: [u32; 2],
-    pub(crate) crop_size: [u32; 2],
-    pub(crate) rfilter: FilterDescription,
-}
-
-#[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(crate) struct FilterDescription {
-    #[serde(rename = "type")]
-    pub(crate) name: String,
-    pub(crate) radius: f32,
-    pub(crate) table: Vec<f32>,
 }
 
 /// `perspective`: a pinhole.

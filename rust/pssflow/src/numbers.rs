@@ -1,7 +1,7 @@
 //! Joins guides to the tracer: at each decision, gathers the paths' numbers, asks the guide, puts them back.
 
 use pss_guide::{Context, Decision as GuideDecision, Guide};
-use pss_render::path::Lanes;
+use pss_render::numbers::Lanes;
 use pss_render::{Decision, NumberSource};
 
 use crate::mixture::Mixture;

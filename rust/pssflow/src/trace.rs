@@ -77,7 +77,7 @@ pub fn rays_alone(tracer: &Tracer<'_>, spp: u32, threads: usize) -> Result<RayTi
     let pool = thread_pool(threads)?;
     let paths = uniform_paths(tracer, 0, spp);
     let width = tracer.columns().width();
-    let logs: Vec<pss_render::path::RayLog> = pool.install(|| {
+    let logs: Vec<pss_render::paths::RayLog> = pool.install(|| {
         paths
             .film
             .par_chunks(BLOCK)
@@ -105,7 +105,7 @@ pub fn rays_alone(tracer: &Tracer<'_>, spp: u32, threads: usize) -> Result<RayTi
         seconds,
         rays: logs
             .iter()
-            .map(pss_render::path::RayLog::len)
+            .map(pss_render::paths::RayLog::len)
             .sum::<usize>() as u64,
         paths: paths.len() as u64,
     })

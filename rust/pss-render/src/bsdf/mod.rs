@@ -119,12 +119,7 @@ impl Builder<'_> {
     }
 
     pub(crate) fn texture(&self, id: TextureId) -> Result<TextureId, SceneError> {
-        crate::description::check_index(
-            id,
-            self.materials.textures.len(),
-            &self.owner(),
-            "texture",
-        )?;
+        crate::arrays::check_index(id, self.materials.textures.len(), &self.owner(), "texture")?;
         Ok(id)
     }
 
@@ -150,7 +145,7 @@ impl Builder<'_> {
         value: f32,
         rule: &'static str,
     ) -> Result<(), SceneError> {
-        crate::description::check(ok, &self.owner(), name, value, rule)
+        crate::arrays::check(ok, &self.owner(), name, value, rule)
     }
 }
 

@@ -3,7 +3,7 @@
 use serde::Deserialize;
 
 use super::{Builder, EmitterModel, EmitterSample, one};
-use crate::description::check_index;
+use crate::arrays::check_index;
 use crate::error::SceneError;
 use crate::interaction::Interaction;
 use crate::math::{Rgb, Vec3};

@@ -3,7 +3,7 @@
 use serde::Deserialize;
 
 use super::{Builder, EmitterModel, EmitterSample, one};
-use crate::description::check_all_finite;
+use crate::arrays::check_all_finite;
 use crate::error::SceneError;
 use crate::interaction::Interaction;
 use crate::math::{Rgb, Vec3};

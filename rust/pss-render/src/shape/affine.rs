@@ -2,7 +2,7 @@
 
 use glam::{Affine3A, Mat3A};
 
-use crate::description::check_all_finite;
+use crate::arrays::check_all_finite;
 use crate::error::SceneError;
 use crate::math::Vec3;
 
@@ -23,7 +23,7 @@ impl Affine {
         );
         let to_object = to_world.inverse();
         let finite = to_object.is_finite() && to_world.matrix3.determinant() != 0.0;
-        crate::description::check(
+        crate::arrays::check(
             finite,
             owner,
             "to_world",

@@ -9,7 +9,7 @@ use serde::Deserialize;
 use super::ShapeModel;
 use super::affine::Affine;
 use crate::bsdf::BsdfId;
-use crate::description::Arrays;
+use crate::arrays::Arrays;
 use crate::error::SceneError;
 use crate::interaction::Interaction;
 use crate::math::Vec3;

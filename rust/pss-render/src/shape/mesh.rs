@@ -8,7 +8,7 @@ use serde::Deserialize;
 
 use super::ShapeModel;
 use crate::bsdf::BsdfId;
-use crate::description::{ArrayRef, Arrays};
+use crate::arrays::{ArrayRef, Arrays};
 use crate::distribution::Discrete;
 use crate::error::SceneError;
 use crate::interaction::Interaction;

@@ -5,8 +5,8 @@ use embree4::{GeomId, Hit, Ray, SceneBuilder};
 use glam::Vec2;
 use serde::Deserialize;
 
+use crate::arrays::Arrays;
 use crate::bsdf::BsdfId;
-use crate::description::Arrays;
 use crate::error::SceneError;
 use crate::interaction::Interaction;
 use crate::math::Vec3;

@@ -9,7 +9,7 @@ use serde::Deserialize;
 use super::affine::Affine;
 use super::{ShapeModel, SurfaceSample, solid_angle_pdf};
 use crate::bsdf::BsdfId;
-use crate::description::{Arrays, check};
+use crate::arrays::{Arrays, check};
 use crate::error::SceneError;
 use crate::interaction::Interaction;
 use crate::math::{RAY_EPSILON, Vec3, safe_sqrt};
@@ -48,7 +48,7 @@ impl Sphere {
             d.radius,
             "positive and finite",
         )?;
-        crate::description::check_all_finite(&d.center, &owner, "center")?;
+        crate::arrays::check_all_finite(&d.center, &owner, "center")?;
         Ok(Self {
             center: Vec3::from_array(d.center),
             radius: d.radius,

@@ -4,7 +4,7 @@ use glam::Vec2;
 use serde::Deserialize;
 
 use super::TextureModel;
-use crate::description::{ArrayRef, Arrays, check_all_finite, check_finite};
+use crate::arrays::{ArrayRef, Arrays, check_all_finite, check_finite};
 use crate::error::SceneError;
 use crate::math::{Rgb, luminance};
 

@@ -4,7 +4,7 @@ use glam::Vec2;
 use serde::Deserialize;
 
 use super::TextureModel;
-use crate::description::{Arrays, check_all_finite};
+use crate::arrays::{Arrays, check_all_finite};
 use crate::error::SceneError;
 use crate::math::Rgb;
 

@@ -3,7 +3,7 @@
 use glam::Vec2;
 use serde::Deserialize;
 
-use crate::description::Arrays;
+use crate::arrays::Arrays;
 use crate::error::SceneError;
 use crate::math::Rgb;
 
