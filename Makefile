@@ -76,7 +76,7 @@ docs: build $(VENV)/.docs ## Rust API into target/doc, Python API into out/docs
 
 .PHONY: clean
 clean: ## what was built, rendered and installed here
-	rm -rf target out $(VENV) .pytest_cache .ruff_cache .hypothesis python/pssflow/_core*.so
+	rm -rf target out $(VENV) .pytest_cache .ruff_cache python/pssflow/_core*.so
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # --- stamps ---------------------------------------------------------------------------------------------------------

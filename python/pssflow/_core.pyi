@@ -66,7 +66,6 @@ class Scene:
         description: str,
         arrays: Sequence[NDArray[Any]],
         search_dirs: Sequence[str] = (),
-        threads: int = 0,
     ) -> None: ...
     @property
     def hash(self) -> str: ...

@@ -378,7 +378,6 @@ def _load(terminal: Terminal, options: Mapping[str, Any]) -> Any:
         options["sensor"],
         size=options["size"],
         scale=options["scale"],
-        threads=options["threads"],
         **dict(options["parameters"]),
     )
 

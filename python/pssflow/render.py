@@ -160,7 +160,7 @@ def render(
         **settings,
     )
     if not isinstance(scene, Scene):
-        scene = Scene(scene, sensor, threads=threads)
+        scene = Scene(scene, sensor)
     elif sensor != 0 and sensor is not scene.sensor and sensor != scene.sensor:
         raise ValueError(
             "`sensor` was given beside a `Scene`, which has its own; make another `Scene`"

@@ -154,7 +154,6 @@ class Scene:
         size: width and height of the film in pixels in place of the scene's own. The horizontal field of view stays,
             the crop becomes the whole film. Changes the `mi.Scene`.
         scale: factor on the film's size in place of `size`; a crop is scaled with it.
-        threads: for the BVH; None for all cores.
         **xml_parameters: values for `$name` in the XML file.
 
     Raises:
@@ -171,10 +170,8 @@ class Scene:
         *,
         size: tuple[int, int] | None = None,
         scale: float | None = None,
-        threads: int | None = None,
         **xml_parameters: Any,
     ) -> None:
-        workers = check_threads(threads)
         self.notes: list[str] = []
         """What the image will not show exactly as Mitsuba would, and which variant had to be taken."""
         start = time.perf_counter()
@@ -186,9 +183,7 @@ class Scene:
         self.exported: Export = export(self.mi_scene, sensor)
         self.notes += self.exported.notes
         exported = time.perf_counter()
-        self.core = _core.Scene(
-            self.exported.json(), self.exported.arrays, embree_dirs(), threads=workers
-        )
+        self.core = _core.Scene(self.exported.json(), self.exported.arrays, embree_dirs())
         self.variant = self.mi_scene.variant_name()
         """The Mitsuba variant that loaded it."""
         self.timings: dict[str, float] = {

@@ -155,7 +155,7 @@ def define() -> Callable[[Any], Any]:
                 sample_count=camera.sampler().sample_count(),
             )
             self.result = run(
-                Scene(scene, camera, threads=plan.threads or None), self.choice, plan, self.progress
+                Scene(scene, camera), self.choice, plan, self.progress
             )
             _fill(camera.film(), self.result.image)
             return camera.film().develop() if develop else mi.TensorXf()

@@ -115,7 +115,7 @@ def bench(
 def contestants(path: Path, spp: int, k: int, threads: int, scale: float) -> list[Contestant]:
     """All that take turns on one scene."""
     mi.set_variant(SCALAR)
-    scene = Scene(path, scale=scale, threads=threads)
+    scene = Scene(path, scale=scale)
     paths = scene.width * scene.height * spp
     alone = scene.core.rays_alone(spp=1, k=k, threads=threads)
     reach = [_reached(scene, bounces) for bounces in range(1, k + 1)]

@@ -27,6 +27,9 @@ pub struct GuideSpec {
     pub defaults: fn() -> Map<String, Value>,
     /// Checks options without fitting.
     pub validate: fn(&Map<String, Value>) -> Result<(), GuideError>,
+    /// Seconds of training that each path costs on one core, roughly, for (options, columns); 0 where it does
+    /// not depend on the number of paths. A render under a time budget gives no more paths than it can afford.
+    pub seconds_per_path: fn(&Map<String, Value>, usize) -> f64,
     /// Fits; see [`fit`].
     pub fit: FitFn,
     /// Rebuilds the guide from a file, or says what does not fit together.
@@ -40,6 +43,9 @@ static REGISTRY: [GuideSpec; 2] = [
         models: &[Decision::Path],
         defaults: || options::to_map(&RealNvpOptions::defaults(Domain::Cube)),
         validate: |o| RealNvpOptions::parse(Domain::Cube, o).map(drop),
+        seconds_per_path: |o, d| {
+            RealNvpOptions::parse(Domain::Cube, o).map_or(0.0, |o| o.seconds_per_path(d))
+        },
         fit: |o, r, s, p| RealNvp::fit(Domain::Cube, o, r, s, p),
         restore: |c| RealNvp::restore(Domain::Cube, c),
     },
@@ -49,6 +55,9 @@ static REGISTRY: [GuideSpec; 2] = [
         models: &[Decision::Path],
         defaults: || options::to_map(&RealNvpOptions::defaults(Domain::Logit)),
         validate: |o| RealNvpOptions::parse(Domain::Logit, o).map(drop),
+        seconds_per_path: |o, d| {
+            RealNvpOptions::parse(Domain::Logit, o).map_or(0.0, |o| o.seconds_per_path(d))
+        },
         fit: |o, r, s, p| RealNvp::fit(Domain::Logit, o, r, s, p),
         restore: |c| RealNvp::restore(Domain::Logit, c),
     },

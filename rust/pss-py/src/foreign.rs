@@ -4,10 +4,11 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use numpy::{PyReadonlyArray1, PyReadonlyArray2};
 use pss_guide::{Context, Decision, Fit, GuideError, Header, Records};
-use pssflow::Learner;
+use pssflow::{Learner, Phase, Progress};
 use pyo3::prelude::*;
 
 use crate::arrays;
+use crate::watch::Shared;
 
 /// The object, and the first error that it raised.
 #[derive(Clone)]
@@ -106,6 +107,22 @@ impl ForeignGuide {
             q.iter_mut().zip(log_q).for_each(|(q, l)| *q = l.exp());
             Ok(())
         })
+    }
+}
+
+/// A listener that also stops the render once the foreign guide has raised.
+pub(crate) struct Guarded<'a> {
+    pub(crate) progress: &'a Shared,
+    pub(crate) guide: Option<&'a ForeignGuide>,
+}
+
+impl Progress for Guarded<'_> {
+    fn update(&self, phase: Phase, done: f32) {
+        self.progress.update(phase, done);
+    }
+
+    fn cancelled(&self) -> bool {
+        self.progress.cancelled() || self.guide.is_some_and(ForeignGuide::failed)
     }
 }
 

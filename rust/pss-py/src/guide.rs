@@ -6,6 +6,7 @@ use std::sync::Arc;
 use numpy::{PyReadonlyArray1, PyReadonlyArray2};
 use pss_guide::{Decision, Header, Records};
 use pss_rng::{Purpose, Stream};
+use pyo3::exceptions::PyMemoryError;
 use pyo3::prelude::*;
 use serde_json::{Map, Value};
 
@@ -108,7 +109,12 @@ impl Guide {
     fn sample(&self, py: Python<'_>, n: usize, seed: u64) -> PyResult<(Py<PyAny>, Py<PyAny>)> {
         let dims = self.inner.dims();
         let stream = Stream::new(seed, Purpose::Guide);
-        let (mut u, mut log_q) = (Vec::with_capacity(n * dims), Vec::with_capacity(n));
+        let too_many =
+            |_| PyMemoryError::new_err(format!("n = {n}: so many rows do not fit in memory"));
+        let (mut u, mut log_q) = (Vec::new(), Vec::new());
+        u.try_reserve_exact(n.saturating_mul(dims))
+            .map_err(too_many)?;
+        log_q.try_reserve_exact(n).map_err(too_many)?;
         for start in (0..n).step_by(CHUNK) {
             py.check_signals()?;
             let rows = (n - start).min(CHUNK);

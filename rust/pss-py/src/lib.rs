@@ -6,6 +6,7 @@ mod arrays;
 mod errors;
 mod foreign;
 mod guide;
+mod output;
 mod parity;
 mod scene;
 mod watch;
@@ -23,7 +24,9 @@ mod _core {
     #[pymodule_export]
     use super::guide::{Guide, guides};
     #[pymodule_export]
-    use super::scene::{Scene, write_exr};
+    use super::output::write_exr;
+    #[pymodule_export]
+    use super::scene::Scene;
 
     use pyo3::prelude::*;
 

@@ -13,7 +13,7 @@ use pyo3::types::PyDict;
 use serde::Deserialize;
 use serde_json::{Map, Value, json};
 
-use crate::foreign::ForeignGuide;
+use crate::foreign::{ForeignGuide, Guarded};
 use crate::guide::Guide;
 use crate::watch::watched;
 use crate::{arrays, errors};
@@ -67,6 +67,10 @@ impl Learner for Named {
         self.spec.name
     }
 
+    fn seconds_per_path(&self, dims: usize) -> f64 {
+        (self.spec.seconds_per_path)(&self.options, dims)
+    }
+
     fn fit(
         &self,
         records: &pss_guide::Records<'_>,
@@ -101,16 +105,13 @@ pub(crate) fn strategy(name: &str) -> PyResult<EmitterStrategy> {
 #[pymethods]
 impl Scene {
     #[new]
-    #[pyo3(signature = (description, arrays, search_dirs=Vec::new(), threads=0))]
+    #[pyo3(signature = (description, arrays, search_dirs=Vec::new()))]
     fn new(
         py: Python<'_>,
         description: &str,
         arrays: Vec<Bound<'_, PyAny>>,
         search_dirs: Vec<PathBuf>,
-        threads: usize,
     ) -> PyResult<Self> {
-        // Embree builds with the threads of its device; the argument is kept for callers that pass it.
-        let _ = threads;
         let owned = arrays
             .iter()
             .enumerate()
@@ -215,9 +216,7 @@ impl Scene {
         threads: usize,
     ) -> PyResult<Bound<'py, PyDict>> {
         let tracer = self.tracer(k, parametrisation, emitter_strategy)?;
-        if spp == 0 {
-            return Err(errors::value("spp = 0: must be at least 1"));
-        }
+        self.check_at_once(spp)?;
         let width = tracer.columns().width();
         let (paths, blocks) = py
             .detach(|| {
@@ -243,11 +242,21 @@ impl Scene {
     ) -> PyResult<Bound<'py, PyDict>> {
         let request: Request = serde_json::from_str(options)
             .map_err(|e| errors::value(format!("render options: {e}")))?;
+        let tracer = self.tracer(
+            request.k,
+            &request.parametrisation,
+            &request.emitter_strategy,
+        )?;
+        let dims = tracer.columns().learned();
         let mut foreign = None;
-        let choice = self.choice(&request, guide.as_ref(), &mut foreign)?;
+        let choice = self.choice(&request, dims, guide.as_ref(), &mut foreign)?;
         let options = self.options(&request, choice)?;
         let outcome = watched(py, progress.as_ref(), |shared| {
-            pssflow::render(&self.inner, &options, shared)
+            let guarded = Guarded {
+                progress: shared,
+                guide: foreign.as_ref(),
+            };
+            pssflow::render(&self.inner, &options, &guarded)
         })?;
         // What the foreign guide raised is the cause of whatever else went wrong.
         if let Some(error) = foreign.as_ref().and_then(ForeignGuide::take_error) {
@@ -291,6 +300,7 @@ impl Scene {
     ) -> PyResult<HashMap<&'static str, f64>> {
         let tracer = Tracer::new(&self.inner, k, Parametrisation::Bsdf, EmitterStrategy::Mis)
             .map_err(errors::trace)?;
+        self.check_at_once(spp)?;
         let timing = py
             .detach(|| pssflow::rays_alone(&tracer, spp, threads))
             .map_err(errors::render)?;
@@ -305,7 +315,21 @@ impl Scene {
     }
 }
 
+/// Paths that are held in memory together, at most.
+const MOST_AT_ONCE: u64 = 1 << 28;
+
 impl Scene {
+    /// Errors unless all paths of `spp` samples a pixel can be held together.
+    fn check_at_once(&self, spp: u32) -> PyResult<()> {
+        let paths = self.inner.film().pixels() as u64 * u64::from(spp);
+        if (1..=MOST_AT_ONCE).contains(&paths) {
+            return Ok(());
+        }
+        Err(errors::value(format!(
+            "spp = {spp} makes {paths} paths at once: must be between 1 and {MOST_AT_ONCE}; trace them in parts"
+        )))
+    }
+
     fn tracer(
         &self,
         k: usize,
@@ -324,6 +348,7 @@ impl Scene {
     fn choice(
         &self,
         request: &Request,
+        dims: usize,
         guide: Option<&Bound<'_, PyAny>>,
         foreign: &mut Option<ForeignGuide>,
     ) -> PyResult<GuideChoice> {
@@ -339,7 +364,7 @@ impl Scene {
                 Ok(GuideChoice::Ready(Arc::clone(&guide.inner)))
             }
             "foreign" => {
-                let object = ForeignGuide::new(given()?, 2 * request.k + 1)?;
+                let object = ForeignGuide::new(given()?, dims)?;
                 *foreign = Some(object.clone());
                 Ok(GuideChoice::Learn(Arc::new(object)))
             }
@@ -398,9 +423,9 @@ fn record(outcome: &Outcome, options: &Options) -> Value {
         "pilot": pilot,
         "mean": outcome.mean(),
         "variance": outcome.relative_variance(),
-        "max_weight": outcome.rendered.max_weight,
-        "max_contribution": outcome.rendered.max_contribution(),
-        "ess": outcome.rendered.ess(),
+        "max_weight": outcome.in_image.max_weight,
+        "max_contribution": outcome.in_image.max_contribution(),
+        "ess": outcome.in_image.ess(),
         "passes": outcome.passes,
         "notes": outcome.notes,
         "training": outcome.training,
@@ -441,39 +466,4 @@ fn traced<'py>(py: Python<'py>, blocks: &[Paths], k: usize) -> PyResult<Bound<'p
     let emitter = blocks.iter().flat_map(Paths::emitters).collect();
     dict.set_item("emitter", arrays::to_vector::<u32>(py, emitter))?;
     Ok(dict)
-}
-
-/// Writes layers of (h, w, 3) values as OpenEXR.
-#[pyfunction]
-pub(crate) fn write_exr(
-    path: PathBuf,
-    layers: HashMap<String, numpy::PyReadonlyArray3<'_, f32>>,
-) -> PyResult<()> {
-    use numpy::PyUntypedArrayMethods;
-    let mut size = None;
-    let mut owned = Vec::new();
-    for (name, array) in &layers {
-        let shape = array.shape();
-        if shape[2] != 3
-            || shape[0] == 0
-            || shape[1] == 0
-            || *size.get_or_insert((shape[1], shape[0])) != (shape[1], shape[0])
-        {
-            return Err(errors::value(format!(
-                "layer {name:?} has shape {shape:?}; all layers must be (height, width, 3) of one size"
-            )));
-        }
-        owned.push((
-            name.as_str(),
-            array.as_array().iter().copied().collect::<Vec<f32>>(),
-        ));
-    }
-    let Some((width, height)) = size else {
-        return Err(errors::value(
-            "layers is empty; give at least the image, under the key \"\"",
-        ));
-    };
-    owned.sort_by_key(|(name, _)| *name);
-    let slices: Vec<(&str, &[f32])> = owned.iter().map(|(n, v)| (*n, v.as_slice())).collect();
-    pssflow::output::write_exr(&path, width as u32, height as u32, &slices).map_err(errors::render)
 }

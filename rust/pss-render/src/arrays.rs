@@ -49,7 +49,10 @@ impl Arrays {
         columns: usize,
     ) -> Result<Vec<f32>, SceneError> {
         let (shape, data) = self.take_any_f32(reference, owner, name)?;
-        if shape.len() != 2 || shape[1] != columns || shape[0] * columns != data.len() {
+        if shape.len() != 2
+            || shape[1] != columns
+            || shape[0].checked_mul(columns) != Some(data.len())
+        {
             return Err(SceneError::Array {
                 owner: owner.to_owned(),
                 name,
@@ -68,7 +71,7 @@ impl Arrays {
         owner: &str,
         name: &'static str,
     ) -> Result<(Vec<usize>, Vec<f32>), SceneError> {
-        match self.take(reference, owner)? {
+        match self.take(reference, owner, name)? {
             Array::F32 { shape, data } => Ok((shape, data)),
             Array::U32 { .. } => Err(SceneError::Array {
                 owner: owner.to_owned(),
@@ -90,7 +93,7 @@ impl Arrays {
         name: &'static str,
         columns: usize,
     ) -> Result<Vec<u32>, SceneError> {
-        match self.take(reference, owner)? {
+        match self.take(reference, owner, name)? {
             Array::U32 { shape, data }
                 if shape.len() == 2
                     && shape[1] == columns
@@ -113,17 +116,19 @@ impl Arrays {
         }
     }
 
-    fn take(&mut self, reference: ArrayRef, owner: &str) -> Result<Array, SceneError> {
-        let count = self.0.len();
-        self.0
-            .get_mut(reference.0)
-            .and_then(Option::take)
-            .ok_or_else(|| SceneError::Reference {
-                owner: owner.to_owned(),
-                what: "array",
-                index: reference.0,
-                count,
-            })
+    fn take(
+        &mut self,
+        reference: ArrayRef,
+        owner: &str,
+        name: &'static str,
+    ) -> Result<Array, SceneError> {
+        check_index(reference.0, self.0.len(), owner, "array")?;
+        self.0[reference.0].take().ok_or_else(|| SceneError::Array {
+            owner: owner.to_owned(),
+            name,
+            found: format!("array {}, which another part took before", reference.0),
+            expected: "one of its own".to_owned(),
+        })
     }
 }
 

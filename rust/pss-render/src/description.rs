@@ -11,11 +11,19 @@ use crate::{bsdf, emitter, film, sensor, shape, texture};
 /// The schema that this version reads.
 pub const SCHEMA: u32 = 1;
 
+/// Which schema a description has, whatever else is in it.
+#[derive(Debug, Deserialize)]
+pub(crate) struct Version {
+    pub(crate) schema: u32,
+}
+
 /// The whole description.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct SceneDescription {
-    pub(crate) schema: u32,
+    /// Read before the rest, as [`Version`].
+    #[serde(rename = "schema")]
+    _schema: u32,
     pub(crate) textures: Vec<texture::Description>,
     pub(crate) bsdfs: Vec<bsdf::Description>,
     pub(crate) shapes: Vec<shape::Description>,

@@ -68,16 +68,39 @@ pub enum SceneError {
         /// Number of vertices.
         vertices: usize,
     },
-    /// Nested BSDFs refer to each other in a circle.
-    #[error("bsdf {id:?} contains itself; nested BSDFs must come before the one that uses them")]
-    Recursion {
+    /// A nested BSDF that does not exist, or that would contain its own parent.
+    #[error(
+        "bsdf {id:?}: nested bsdf {nested} must come before the one that uses it, and does not"
+    )]
+    Nested {
         /// The BSDF.
         id: String,
+        /// Index of the nested one.
+        nested: usize,
     },
     /// Nothing to hit.
     #[error("the scene has no shape; add one, or render it with Mitsuba's `path`")]
     Empty,
-    /// Embree refused the geometry.
+    /// A shape and an area emitter do not name each other.
+    #[error(
+        "shape {shape:?} and emitter {emitter:?}: only one of them names the other; \
+         an area emitter and its shape must name each other. Export the scene again"
+    )]
+    Attachment {
+        /// The shape's id.
+        shape: String,
+        /// The emitter's id.
+        emitter: String,
+    },
+    /// Embree refused a shape.
+    #[error("{owner}: {source}")]
+    Geometry {
+        /// The shape.
+        owner: String,
+        /// Embree's reason.
+        source: embree4::EmbreeError,
+    },
+    /// Embree itself failed.
     #[error("{0}")]
     Embree(#[from] embree4::EmbreeError),
 }

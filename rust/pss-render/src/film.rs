@@ -2,7 +2,8 @@
 //!
 //! A pixel is Σ w·v / Σ w over the samples within the filter's radius, as in Mitsuba's `hdrfilm`; for the
 //! box filter that is the mean of the pixel's own samples. Beside it the variance of that mean:
-//! Σ w²(v − pixel)² / (Σ w)², with Bessel's correction for equal weights.
+//! Σ w²(v − pixel)² / (Σ w)² ÷ c, where c = 1 − 2 Σw³/(Σw·Σw²) + Σw²/(Σw)² makes it unbiased for independent
+//! samples of one distribution; for n equal weights c = 1 − 1/n, Bessel's correction.
 
 use serde::Deserialize;
 
@@ -26,6 +27,9 @@ pub(crate) struct FilterDescription {
     pub(crate) radius: f32,
     pub(crate) table: Vec<f32>,
 }
+
+/// A pixel's sums take 104 bytes: a larger image would not fit in memory.
+const MOST_PIXELS: u64 = 1 << 28;
 
 /// Size, crop and reconstruction filter.
 #[derive(Clone, Debug)]
@@ -95,6 +99,14 @@ impl Film {
                     "positive and inside the film",
                 ));
             }
+        }
+        let pixels = d.crop_size.iter().map(|&n| u64::from(n)).product::<u64>();
+        if pixels > MOST_PIXELS {
+            return Err(value(
+                "crop_size",
+                pixels as f64,
+                "at most 268435456 pixels in all; render it in crops",
+            ));
         }
         let filter = if d.rfilter.name == "box" {
             None
@@ -182,6 +194,8 @@ struct Sums {
     weight: f64,
     /// Σ w²
     weight_2: f64,
+    /// Σ w³
+    weight_3: f64,
     /// Σ w·v
     value: [f64; 3],
     /// Σ w²·v
@@ -298,6 +312,7 @@ impl Accumulator {
         let w = f64::from(w);
         s.weight += w;
         s.weight_2 += w * w;
+        s.weight_3 += w * w * w;
         // Most paths carry nothing.
         if value != Rgb::ZERO {
             for (c, v) in value.to_array().into_iter().map(f64::from).enumerate() {
@@ -321,6 +336,7 @@ impl Accumulator {
                 let (to, from) = (&mut self.sums[i], &other.sums[j]);
                 to.weight += from.weight;
                 to.weight_2 += from.weight_2;
+                to.weight_3 += from.weight_3;
                 for c in 0..3 {
                     to.value[c] += from.value[c];
                     to.value_w2[c] += from.value_w2[c];
@@ -341,11 +357,12 @@ impl Accumulator {
                     mean = s.value[c] / s.weight;
                     let squares =
                         s.square_w2[c] - 2.0 * mean * s.value_w2[c] + mean * mean * s.weight_2;
-                    // Σw² / (Σw)² = 1/n for n equal weights; n/(n − 1) makes the estimate unbiased.
-                    let inverse_n = s.weight_2 / (s.weight * s.weight);
-                    var = squares.max(0.0) / (s.weight * s.weight);
-                    var = if inverse_n < 1.0 {
-                        var / (1.0 - inverse_n)
+                    let w_2 = s.weight * s.weight;
+                    let correction =
+                        1.0 - 2.0 * s.weight_3 / (s.weight * s.weight_2) + s.weight_2 / w_2;
+                    // Zero but for rounding where one sample has all the weight.
+                    var = if correction > 1e-9 {
+                        squares.max(0.0) / w_2 / correction
                     } else {
                         f64::INFINITY
                     };
@@ -359,6 +376,75 @@ impl Accumulator {
             variance,
             found: self.counts.iter().map(|c| c[0]).collect(),
             nonzero: self.counts.iter().map(|c| c[1]).collect(),
+        }
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+
+    fn film(name: &str, radius: f32) -> Film {
+        let table = (0..33).map(|i| (-2.0 * (i as f32 / 32.0 * radius).powi(2)).exp());
+        Film::build(Description {
+            size: [5, 5],
+            crop_offset: [0, 0],
+            crop_size: [5, 5],
+            rfilter: FilterDescription {
+                name: name.to_owned(),
+                radius,
+                table: table.collect(),
+            },
+        })
+        .unwrap()
+    }
+
+    #[test]
+    fn the_variance_is_that_of_the_mean_for_any_filter() {
+        let stream = pss_rng::Stream::new(7, pss_rng::Purpose::Test);
+        for (film, spp) in [
+            (film("box", 0.5), 2),
+            (film("gaussian", 2.0), 1),
+            (film("gaussian", 2.0), 4),
+        ] {
+            let repeats = 20_000;
+            let (mut sum, mut sum_2, mut predicted) = (0.0, 0.0, 0.0);
+            for repeat in 0..repeats {
+                let mut numbers = stream.sequence(repeat, spp);
+                let mut image = Accumulator::whole(&film);
+                for pixel in 0..25 {
+                    for _ in 0..spp {
+                        let position = [
+                            (pixel % 5) as f32 + numbers.next_f32(),
+                            (pixel / 5) as f32 + numbers.next_f32(),
+                        ];
+                        image.add(&film, position, Rgb::splat(numbers.next_f32()), true);
+                    }
+                }
+                let developed = image.develop();
+                let centre = f64::from(developed.image[3 * 12]);
+                sum += centre;
+                sum_2 += centre * centre;
+                predicted += f64::from(developed.variance[3 * 12]);
+            }
+            let n = f64::from(repeats);
+            let variance = (sum_2 - sum * sum / n) / (n - 1.0);
+            // Five standard errors of either variance are below 6 %.
+            let ratio = predicted / n / variance;
+            assert!((ratio - 1.0).abs() < 0.06, "{film:?} {spp} spp: {ratio}");
+        }
+    }
+
+    #[test]
+    fn one_sample_says_nothing_of_its_variance() {
+        for film in [film("box", 0.5), film("gaussian", 2.0)] {
+            let mut image = Accumulator::whole(&film);
+            image.add(&film, [2.3, 2.9], Rgb::splat(0.7), true);
+            let developed = image.develop();
+            assert_eq!(developed.variance[3 * 12], f32::INFINITY);
+            assert!((developed.image[3 * 12] - 0.7).abs() < 1e-6);
+            assert_eq!((developed.found[12], developed.nonzero[12]), (1, 1));
         }
     }
 }

@@ -6,7 +6,7 @@ use serde::Deserialize;
 use crate::arrays::{Array, Arrays, check, check_index};
 use crate::bsdf::{Bsdf, Materials};
 use crate::columns::EmitterStrategy;
-use crate::description::{SCHEMA, SceneDescription, scene_hash};
+use crate::description::{SCHEMA, SceneDescription, Version, scene_hash};
 use crate::distribution::Discrete;
 use crate::emitter::{self, Emitter};
 use crate::error::SceneError;
@@ -32,7 +32,7 @@ pub struct Summary {
     pub emitters: std::collections::BTreeMap<String, usize>,
     /// Bytes of geometry held.
     pub geometry_bytes: usize,
-    /// Bytes of textures held.
+    /// Number of textures.
     pub textures: usize,
 }
 
@@ -69,6 +69,29 @@ pub(crate) struct BsdfTraits {
     pub(crate) anisotropic: bool,
 }
 
+/// Errors unless shapes and area emitters name each other: a ray that hits the shape must find the very
+/// light that next-event estimation samples, or their weights do not add up to one.
+fn check_attachments(
+    shapes: &[Common],
+    emitters: &[Emitter],
+    ids: &[String],
+) -> Result<(), SceneError> {
+    let on = |e: usize| emitters[e].model().shape();
+    let lost_shape =
+        (0..shapes.len()).find(|&s| shapes[s].emitter.is_some_and(|e| on(e) != Some(s)));
+    let lost_emitter =
+        (0..emitters.len()).find(|&e| on(e).is_some_and(|s| shapes[s].emitter != Some(e)));
+    let (shape, emitter) = match (lost_shape, lost_emitter) {
+        (Some(s), _) => (Some(s), shapes[s].emitter),
+        (None, Some(e)) => (on(e), Some(e)),
+        (None, None) => return Ok(()),
+    };
+    Err(SceneError::Attachment {
+        shape: shape.map(|s| shapes[s].id.clone()).unwrap_or_default(),
+        emitter: emitter.map(|e| ids[e].clone()).unwrap_or_default(),
+    })
+}
+
 impl Scene {
     /// Builds a scene from its description (JSON, schema 1) and arrays, and its BVH on `device`.
     ///
@@ -76,18 +99,20 @@ impl Scene {
     /// [`SceneError`]; it names the shape, BSDF, emitter or texture, and the rule that it breaks.
     pub fn new(description: &str, arrays: Vec<Array>, device: &Device) -> Result<Self, SceneError> {
         let mut description: serde_json::Value = serde_json::from_str(description)?;
+        // Before the rest, which another schema may have changed.
+        let found = Version::deserialize(&description)?.schema;
+        if found != SCHEMA {
+            return Err(SceneError::Schema {
+                found,
+                expected: SCHEMA,
+            });
+        }
         // The same scene loaded in another Mitsuba variant is the same scene.
         if let Some(fields) = description.as_object_mut() {
             fields.remove("variant");
         }
         let hash = scene_hash(&description, &arrays);
         let d = SceneDescription::deserialize(description)?;
-        if d.schema != SCHEMA {
-            return Err(SceneError::Schema {
-                found: d.schema,
-                expected: SCHEMA,
-            });
-        }
         let mut arrays = Arrays::new(arrays);
 
         let mut materials = Materials::default();
@@ -119,7 +144,10 @@ impl Scene {
             if let Some(e) = common.emitter {
                 check_index(e, d.emitters.len(), &owner, "emitter")?;
             }
-            shape.model().attach(&mut builder)?;
+            shape
+                .model()
+                .attach(&mut builder)
+                .map_err(|source| SceneError::Geometry { owner, source })?;
             shapes.push(shape);
             commons.push(common);
         }
@@ -141,6 +169,7 @@ impl Scene {
             .iter()
             .map(emitter::Description::sampling_weight)
             .collect();
+        let emitter_ids: Vec<String> = d.emitters.iter().map(|e| e.id().to_owned()).collect();
         let mut emitters = Vec::new();
         for e in d.emitters {
             emitters.push(Emitter::build(
@@ -151,6 +180,7 @@ impl Scene {
                 },
             )?);
         }
+        check_attachments(&commons, &emitters, &emitter_ids)?;
         let environments = (0..emitters.len())
             .filter(|&i| emitters[i].model().is_environment())
             .collect();

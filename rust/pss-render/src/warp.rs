@@ -64,10 +64,10 @@ pub(crate) fn cosine_hemisphere_pdf(cos_theta: f32) -> f32 {
     cos_theta * INV_PI
 }
 
-/// Density of directions uniform in the cone of half-angle `acos(cos_cutoff)`.
+/// Density of directions uniform in a cone of half-angle θ, `depth` = 1 − cos θ.
 #[inline]
-pub(crate) fn uniform_cone_pdf(cos_cutoff: f32) -> f32 {
-    1.0 / (TAU * (1.0 - cos_cutoff))
+pub(crate) fn uniform_cone_pdf(depth: f32) -> f32 {
+    1.0 / (TAU * depth)
 }
 
 /// Density of [`square_to_uniform_sphere`].

@@ -194,7 +194,7 @@ fn bad_scenes_are_refused_with_the_offender_and_the_rule() {
         ),
         (
             edit(&|d| d["shapes"][0]["faces"] = json!(0)),
-            "shape \"leaf\": array 0 does not exist (there are 2)",
+            "shape \"leaf\": array `faces` has array 0, which another part took before, expected one of its own",
         ),
         (
             edit(&|d| d["shapes"][0]["positions"] = json!(1)),
@@ -216,7 +216,27 @@ fn bad_scenes_are_refused_with_the_offender_and_the_rule() {
             edit(&|d| {
                 d["bsdfs"] = json!([{ "type": "twosided", "id": "a", "front": 0, "back": 0 }])
             }),
-            "bsdf \"a\" contains itself; nested BSDFs must come before the one that uses them",
+            "bsdf \"a\": nested bsdf 0 must come before the one that uses it, and does not",
+        ),
+        (
+            edit(&|d| {
+                d["schema"] = json!(2);
+                d["lights"] = json!([]);
+            }),
+            "scene description has schema 2, this version reads 1. Export the scene again",
+        ),
+        (
+            edit(&|d| {
+                d["film"]["size"] = json!([65536, 65536]);
+                d["film"]["crop_size"] = json!([65536, 65536]);
+            }),
+            "film: `crop_size` = 4294967296, but it must be at most 268435456 pixels in all; \
+             render it in crops",
+        ),
+        (
+            triangle(vec![0., 0., 1., 1e30, 0., 1., 0., 1., 1.], vec![0, 1, 2]),
+            "shape \"leaf\": positions[1] = [1e30, 0.0, 1.0] must be finite and within ±1e18 (Embree drops \
+             such triangles silently). Repair or rescale the mesh",
         ),
         (
             edit(&|d| d["bsdfs"][0]["reflectance"] = json!(5)),
@@ -285,4 +305,71 @@ fn one_scene_has_one_hash_and_another_another() {
     llvm["variant"] = json!("llvm_ad_rgb");
     assert_eq!(hash(&furnace(0.5, 1.0)), hash(&llvm));
     assert_ne!(hash(&furnace(0.5, 1.0)), hash(&furnace(0.5, 1.1)));
+}
+
+#[test]
+fn a_shape_and_its_area_emitter_name_each_other() {
+    let message = |edit: &dyn Fn(&mut Value)| {
+        let mut d = furnace(0.5, 1.0);
+        edit(&mut d);
+        build(&d, Vec::new()).unwrap_err().to_string()
+    };
+    let expected = |shape: &str, emitter: &str| {
+        format!(
+            "shape {shape:?} and emitter {emitter:?}: only one of them names the other; \
+             an area emitter and its shape must name each other. Export the scene again"
+        )
+    };
+    assert_eq!(
+        message(&|d| d["shapes"][0]["emitter"] = Value::Null),
+        expected("furnace", "furnace.emitter")
+    );
+    assert_eq!(
+        message(&|d| {
+            d["emitters"] =
+                json!([{ "type": "constant", "id": "sky", "radiance": [1.0, 1.0, 1.0] }]);
+        }),
+        expected("furnace", "sky")
+    );
+    assert_eq!(
+        message(&|d| {
+            let mut second = d["shapes"][0].clone();
+            second["id"] = json!("copy");
+            d["shapes"] = json!([d["shapes"][0], second]);
+        }),
+        expected("copy", "furnace.emitter")
+    );
+}
+
+#[test]
+fn shapes_of_arrays_are_checked_without_overflow() {
+    let mut d = furnace(0.5, 1.0);
+    d["textures"][0] = json!({
+        "type": "bitmap", "id": "albedo", "data": 0, "to_uv": [1, 0, 0, 0, 1, 0, 0, 0, 1],
+        "wrap": "repeat", "filter": "nearest", "mean": 0.5,
+    });
+    for shape in [
+        vec![usize::MAX, 2, 3],
+        vec![1 << 40, 1, 1],
+        vec![0, 1, 1],
+        vec![3],
+    ] {
+        let array = Array::F32 {
+            shape: shape.clone(),
+            data: vec![0.5; 3],
+        };
+        assert_eq!(
+            build(&d, vec![array]).unwrap_err().to_string(),
+            format!(
+                "texture \"albedo\": array `data` has shape {shape:?}, expected (height, width, 1 or 3)"
+            )
+        );
+    }
+    let (d, mut arrays) = triangle(vec![0.0; 9], vec![0, 1, 2]);
+    arrays[0] = Array::F32 {
+        shape: vec![usize::MAX, 3],
+        data: vec![0.0; 9],
+    };
+    let message = build(&d, arrays).unwrap_err().to_string();
+    assert!(message.contains("expected (n, 3)"), "{message}");
 }

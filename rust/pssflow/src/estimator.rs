@@ -50,6 +50,8 @@ pub struct Outcome {
     pub pilot: Statistics,
     /// The paths after it.
     pub rendered: Statistics,
+    /// All paths in the image: the rendered ones, and the pilot's where it was kept.
+    pub in_image: Statistics,
     /// Wall time.
     pub seconds: Seconds,
     /// Threads that rendered.
@@ -87,9 +89,11 @@ impl Outcome {
 
 /// Share of a time budget that the pilot may take.
 const PILOT_TIME: f64 = 1.0 / 7.0;
-/// Samples per pixel of a pilot under `--spp`: this share of the total.
-const PILOT_SPP: u32 = 4;
+/// Under `--spp`, one sample in so many is the pilot's.
+const PILOT_DIVISOR: u32 = 4;
 
+/// Share of a time budget that training is planned to take; what takes longer than the whole is given up.
+const TRAINING_TIME: f64 = 0.3;
 /// Samples per pixel that a timed pilot's memory for records is planned for.
 const TIMED_PILOT_SPP: u32 = 64;
 
@@ -129,11 +133,20 @@ pub fn render(
     };
 
     let guide = match &options.guide {
-        GuideChoice::None => None,
-        GuideChoice::Ready(guide) => Some(Arc::clone(guide)),
         GuideChoice::Learn(learner) => {
-            let records = run.pilot()?;
+            let dims = run.context.tracer.columns().learned();
+            let records = run.pilot(learner.seconds_per_path(dims))?;
             run.fit(learner.as_ref(), &records)?
+        }
+        ready => {
+            // A recorded pilot is part of the image, also where its guide is at hand already.
+            if matches!(options.budget, Budget::Replay(_)) {
+                run.pilot(0.0)?;
+            }
+            match ready {
+                GuideChoice::Ready(guide) => Some(Arc::clone(guide)),
+                _ => None,
+            }
         }
     };
     if let Some(guide) = &guide {
@@ -171,7 +184,7 @@ struct Run<'a> {
 
 impl Run<'_> {
     /// Random paths; they stay in the image unless the preset discards them.
-    fn pilot(&mut self) -> Result<PilotRecords, RenderError> {
+    fn pilot(&mut self, seconds_per_path: f64) -> Result<PilotRecords, RenderError> {
         let start = Instant::now();
         let mut records = PilotRecords::default();
         match (self.options.budget.clone(), self.options.pilot_spp) {
@@ -186,32 +199,50 @@ impl Run<'_> {
                     done += pass.spp;
                 }
             }
-            (Budget::Spp(_) | Budget::Time(_), Some(spp)) => {
+            (Budget::Spp(_), Some(spp)) => {
                 self.pilot_pass(spp, self.record_share(spp), (0.0, 1.0), &mut records)?;
             }
             (Budget::Spp(spp), None) => {
-                let spp = (spp / PILOT_SPP).max(1);
+                let spp = (spp / PILOT_DIVISOR).max(1);
                 self.pilot_pass(spp, self.record_share(spp), (0.0, 1.0), &mut records)?;
             }
-            (Budget::Time(time), None) => {
-                // One sample a pixel, then as many more as its measured speed allows.
-                self.pilot_pass(
-                    1,
-                    self.record_share(TIMED_PILOT_SPP),
-                    (0.0, 0.1),
-                    &mut records,
-                )?;
-                let each = start.elapsed().as_secs_f64();
-                let more =
-                    ((time * PILOT_TIME - each) / each).clamp(0.0, f64::from(1 << 20)) as u32;
-                if more > 0 {
-                    let record = self.record_share(more.max(TIMED_PILOT_SPP));
-                    self.pilot_pass(more, record, (0.1, 1.0), &mut records)?;
-                }
+            (Budget::Time(time), spp) => {
+                self.timed_pilot(time, spp, seconds_per_path, &mut records)?;
             }
         }
         self.seconds.pilot = start.elapsed().as_secs_f64();
         Ok(records)
+    }
+
+    /// One sample a pixel, then as many more as its measured speed allows (or as were asked for), of which no
+    /// more paths are kept than the guide can be trained on in its share of the time.
+    fn timed_pilot(
+        &mut self,
+        time: f64,
+        spp: Option<u32>,
+        seconds_per_path: f64,
+        records: &mut PilotRecords,
+    ) -> Result<(), RenderError> {
+        let start = Instant::now();
+        let pixels = self.context.tracer.scene().film().pixels() as f64;
+        let affordable = time * TRAINING_TIME / seconds_per_path.max(f64::MIN_POSITIVE);
+        // How many paths carry light is not known yet; a quarter of all is on the high side.
+        let first = (4.0 * affordable / pixels).min(1.0) as f32;
+        let first = first.min(self.record_share(TIMED_PILOT_SPP));
+        self.pilot_pass(1, first, (0.0, 0.1), records)?;
+        let each = start.elapsed().as_secs_f64();
+        let more = match spp {
+            Some(spp) => spp - 1,
+            None => ((time * PILOT_TIME - each) / each).clamp(0.0, f64::from(1 << 20)) as u32,
+        };
+        if more == 0 {
+            return Ok(());
+        }
+        let nonzero = self.pilot.counts.nonzero as f64 * f64::from(more);
+        let left = (affordable - records.f.len() as f64).max(0.0);
+        let record = (left / nonzero.max(1.0)).min(1.0) as f32;
+        let record = record.min(self.record_share(more.max(TIMED_PILOT_SPP)));
+        self.pilot_pass(more, record, (0.1, 1.0), records)
     }
 
     /// Share of the light-carrying paths to keep so that a pilot of `spp` fits the memory for records, even
@@ -305,10 +336,8 @@ impl Run<'_> {
                 Ok(Some(Arc::from(fit.guide)))
             }
             Err(GuideError::Cancelled) if late => {
-                self.notes.push(format!(
-                    "{}: training did not end within the time; none is used",
-                    learner.name()
-                ));
+                self.notes
+                    .push("training did not end within the time; none is used".to_owned());
                 Ok(None)
             }
             Err(GuideError::Cancelled) => Err(RenderError::Cancelled),
@@ -346,14 +375,12 @@ impl Run<'_> {
                 }
             }
             Budget::Replay(passes) => {
-                let mut rest: Vec<_> = passes
-                    .iter()
-                    .filter(|p| p.kind != PassKind::Pilot)
-                    .collect();
-                let total: u32 = rest.iter().map(|p| p.spp).sum();
+                let rest = passes.iter().filter(|p| p.kind != PassKind::Pilot);
+                let total: u32 = rest.clone().map(|p| p.spp).sum();
                 let mut done = 0;
-                for pass in rest.drain(..) {
+                for pass in rest {
                     let share = |n: u32| n as f32 / total as f32;
+                    let guide = guide.filter(|_| pass.kind == PassKind::Guided);
                     self.pass(pass.spp, guide, (share(done), share(done + pass.spp)))?;
                     done += pass.spp;
                 }
@@ -375,10 +402,12 @@ impl Run<'_> {
             if rendered > 0 {
                 let each = start.elapsed().as_secs_f64() / f64::from(rendered);
                 let left = ((time - now) / each).clamp(0.0, f64::from(1 << 20)) as u32;
-                if left == 0 {
+                spp = (2 * spp)
+                    .min(left)
+                    .min(Options::MOST_SPP.saturating_sub(self.next_sample));
+                if spp == 0 {
                     break;
                 }
-                spp = (2 * spp).min(left);
             } else if !self.passes.is_empty() && self.options.keep_pilot && now >= time {
                 break;
             }
@@ -427,6 +456,15 @@ impl Run<'_> {
     }
 
     fn finish(mut self, guide: Option<Arc<dyn Guide>>) -> Outcome {
+        // A guide that was learned just as the time ran out drew nothing, and is not what was rendered with.
+        let drawn = self.passes.iter().any(|p| p.kind == PassKind::Guided);
+        if let Some(unused) = guide.as_ref().filter(|_| !drawn) {
+            let name = unused.name();
+            self.notes.push(format!(
+                "{name}: the time was out after training; none is used"
+            ));
+        }
+        let guide = guide.filter(|_| drawn);
         let [width, height] = self.context.tracer.scene().film().crop_size();
         let film = self.image.develop();
         let mut all = self.pilot;
@@ -465,6 +503,11 @@ impl Run<'_> {
             passes: self.passes,
             pilot: self.pilot,
             rendered: self.rendered,
+            in_image: if self.options.keep_pilot {
+                all
+            } else {
+                self.rendered
+            },
             seconds: self.seconds,
             threads: self.context.pool.current_num_threads(),
         }

@@ -29,18 +29,20 @@ impl Mixture {
         coin >= self.uniform_fraction
     }
 
-    /// f ÷ m, each term by the density of the numbers that it uses.
+    /// f ÷ m, each term by the density of the numbers that it uses, and the larger 1/m of the terms that
+    /// carry light (0 where none does).
     #[inline]
-    pub fn divide(&self, f_nee: Rgb, q_nee: f32, f_bsdf: Rgb, q_bsdf: f32) -> Rgb {
-        let mut estimate = Rgb::ZERO;
-        // A term of zero stays zero, also where its density is zero.
-        if f_nee != Rgb::ZERO {
-            estimate += f_nee / self.density(q_nee);
+    pub fn divide(&self, f_nee: Rgb, q_nee: f32, f_bsdf: Rgb, q_bsdf: f32) -> (Rgb, f32) {
+        let (mut estimate, mut weight) = (Rgb::ZERO, 0.0f32);
+        for (f, q) in [(f_nee, q_nee), (f_bsdf, q_bsdf)] {
+            // A term of zero stays zero, also where its density is zero.
+            if f != Rgb::ZERO {
+                let m = self.density(q);
+                estimate += f / m;
+                weight = weight.max(1.0 / m);
+            }
         }
-        if f_bsdf != Rgb::ZERO {
-            estimate += f_bsdf / self.density(q_bsdf);
-        }
-        estimate
+        (estimate, weight)
     }
 }
 
@@ -67,7 +69,18 @@ mod tests {
             uniform_fraction: 0.1,
         };
         let f = Rgb::new(1.0, 2.0, 3.0);
-        let estimate = m.divide(f, 1.0, f, 1.0);
+        let (estimate, weight) = m.divide(f, 1.0, f, 1.0);
         assert!((estimate - f * 2.0).length() < 1e-5);
+        assert_eq!(weight, 1.0);
+    }
+
+    #[test]
+    fn a_dark_term_has_no_weight() {
+        let m = Mixture {
+            uniform_fraction: 0.0,
+        };
+        let (estimate, weight) = m.divide(Rgb::ZERO, 0.0, Rgb::ONE, 4.0);
+        assert_eq!((estimate, weight), (Rgb::splat(0.25), 0.25));
+        assert_eq!(m.divide(Rgb::ZERO, 0.0, Rgb::ZERO, 0.0), (Rgb::ZERO, 0.0));
     }
 }

@@ -10,7 +10,7 @@ use crate::mixture::Mixture;
 pub(crate) struct GuidedNumbers<'a> {
     guide: &'a dyn Guide,
     /// Per path of the block: whether its coin chose the guide.
-    pub(crate) guided: Vec<bool>,
+    guided: Vec<bool>,
     looks_at_vertices: bool,
     scratch: Scratch,
 }
@@ -55,19 +55,17 @@ impl<'a> GuidedNumbers<'a> {
             s.lanes.push(lane);
             let row = lane as usize * lanes.width;
             s.u.extend_from_slice(&lanes.u[row..][lanes.columns.clone()]);
-            s.contexts.push(
-                lanes
-                    .contexts
-                    .get(i)
-                    .map_or_else(Context::default, |c| Context {
-                        position: c.position,
-                        normal: c.normal,
-                        outgoing: c.outgoing,
-                        pixel: c.pixel,
-                        emitter: c.emitter,
-                        bounce: c.bounce,
-                    }),
-            );
+            // One an active path, or none at all where the guide looks at nothing.
+            if let Some(c) = lanes.contexts.get(i) {
+                s.contexts.push(Context {
+                    position: c.position,
+                    normal: c.normal,
+                    outgoing: c.outgoing,
+                    pixel: c.pixel,
+                    emitter: c.emitter,
+                    bounce: c.bounce,
+                });
+            }
         }
         if s.lanes.is_empty() {
             return;

@@ -13,6 +13,11 @@ pub trait Learner: Send + Sync {
     /// The guide's name.
     fn name(&self) -> &str;
 
+    /// Seconds of training that each path costs, roughly; 0 where it does not depend on their number.
+    fn seconds_per_path(&self, _dims: usize) -> f64 {
+        0.0
+    }
+
     /// Learns. `progress` gets the share that is done and answers whether to go on.
     ///
     /// # Errors
@@ -125,8 +130,8 @@ impl Default for Options {
 }
 
 impl Options {
-    /// Samples per pixel that no image can hold.
-    const MOST_SPP: u32 = 1 << 24;
+    /// Samples per pixel beyond which single-precision numbers have nothing new to say.
+    pub(crate) const MOST_SPP: u32 = 1 << 24;
 
     pub(crate) fn check(&self) -> Result<(), RenderError> {
         let error = |name, value: String, rule| Err(RenderError::Option { name, value, rule });
@@ -141,34 +146,133 @@ impl Options {
             Budget::Time(t) if !(t.is_finite() && *t > 0.0) => {
                 return error("time", t.to_string(), "positive and finite (seconds)");
             }
-            Budget::Replay(passes) if passes.is_empty() || passes.iter().any(|p| p.spp == 0) => {
-                return error(
-                    "replay",
-                    format!("{passes:?}"),
-                    "at least one pass, each of 1 spp or more",
-                );
-            }
+            Budget::Replay(passes) => self.check_replay(passes)?,
             _ => {}
         }
-        if self.pilot_spp == Some(0) && matches!(self.guide, GuideChoice::Learn(_)) {
+        let pilot = self.pilot_spp.unwrap_or(1);
+        if matches!(self.guide, GuideChoice::Learn(_)) && !(1..=Self::MOST_SPP).contains(&pilot) {
             return error(
                 "pilot_spp",
-                "0".to_owned(),
-                "at least 1 for a guide that learns",
+                pilot.to_string(),
+                "between 1 and 16777216 for a guide that learns",
             );
         }
-        if let (GuideChoice::Learn(_), Budget::Spp(spp), pilot) =
-            (&self.guide, &self.budget, self.pilot_spp)
+        if let (GuideChoice::Learn(_), Budget::Spp(spp)) = (&self.guide, &self.budget)
+            && *spp <= pilot
         {
-            let least = pilot.unwrap_or(1) + 1;
-            if *spp < least {
-                return error(
-                    "spp",
-                    spp.to_string(),
-                    "more than the pilot's, since spp is the total and the guide needs a pass of its own",
-                );
-            }
+            return error(
+                "spp",
+                spp.to_string(),
+                "more than the pilot's, since spp is the total and the guide needs a pass of its own",
+            );
         }
         Ok(())
+    }
+
+    fn check_replay(&self, passes: &[PassPlan]) -> Result<(), RenderError> {
+        let error = |value: String, rule| {
+            Err(RenderError::Option {
+                name: "replay",
+                value,
+                rule,
+            })
+        };
+        let total: u64 = passes.iter().map(|p| u64::from(p.spp)).sum();
+        if passes.iter().any(|p| p.spp == 0) || !(1..=u64::from(Self::MOST_SPP)).contains(&total) {
+            return error(
+                format!("{} passes of {total} spp together", passes.len()),
+                "at least one pass, each of 1 spp or more, and 16777216 spp at most together",
+            );
+        }
+        if let Some(p) = passes.iter().find(|p| !(0.0..=1.0).contains(&p.record)) {
+            return error(
+                format!("a pass with record {}", p.record),
+                "passes whose record lies in [0, 1]",
+            );
+        }
+        let guided = passes.iter().any(|p| p.kind == PassKind::Guided);
+        if guided && matches!(self.guide, GuideChoice::None) {
+            return error(
+                "guided passes without a guide".to_owned(),
+                "given together with the guide of the recorded render",
+            );
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+
+    struct Idle;
+
+    impl Learner for Idle {
+        fn name(&self) -> &str {
+            "idle"
+        }
+
+        fn fit(
+            &self,
+            _records: &Records<'_>,
+            _seed: u64,
+            _progress: &mut dyn FnMut(f32) -> bool,
+        ) -> Result<Fit, GuideError> {
+            Err(GuideError::Cancelled)
+        }
+    }
+
+    fn refusal(guide: GuideChoice, budget: Budget, pilot_spp: Option<u32>) -> String {
+        let options = Options {
+            guide,
+            budget,
+            pilot_spp,
+            ..Options::default()
+        };
+        options.check().unwrap_err().to_string()
+    }
+
+    fn pass(kind: PassKind, spp: u32, record: f32) -> PassPlan {
+        PassPlan { kind, spp, record }
+    }
+
+    #[test]
+    fn sample_counts_beyond_all_bounds_are_refused() {
+        let learn = || GuideChoice::Learn(Arc::new(Idle));
+        for pilot in [0, u32::MAX] {
+            for budget in [Budget::Spp(16), Budget::Time(1.0)] {
+                let message = refusal(learn(), budget, Some(pilot));
+                assert!(message.starts_with("pilot_spp = "), "{message}");
+            }
+        }
+        let message = refusal(learn(), Budget::Spp(4), Some(4));
+        assert!(message.starts_with("spp = 4: must be more"), "{message}");
+        let message = refusal(GuideChoice::None, Budget::Spp(u32::MAX), None);
+        assert!(message.starts_with("spp = 4294967295"), "{message}");
+    }
+
+    #[test]
+    fn a_replay_that_cannot_be_repeated_is_refused() {
+        let uniform = |spp| pass(PassKind::Uniform, spp, 1.0);
+        for (passes, start) in [
+            (vec![], "replay = 0 passes of 0 spp together: must be"),
+            (vec![uniform(1), uniform(0)], "replay = 2 passes of 1 spp"),
+            (
+                vec![uniform(u32::MAX); 2],
+                "replay = 2 passes of 8589934590 spp",
+            ),
+            (
+                vec![pass(PassKind::Pilot, 1, -0.5)],
+                "replay = a pass with record -0.5",
+            ),
+            (
+                vec![pass(PassKind::Guided, 1, 1.0)],
+                "replay = guided passes without a guide",
+            ),
+        ] {
+            let message = refusal(GuideChoice::None, Budget::Replay(passes), None);
+            assert!(message.starts_with(start), "{message}");
+        }
     }
 }

@@ -3,6 +3,7 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use exr::prelude::{AnyChannel, AnyChannels, FlatSamples, Image, WritableImage};
 
@@ -68,11 +69,14 @@ pub fn write_beside(
     let name = path
         .file_name()
         .ok_or_else(|| error("it names no file".to_owned()))?;
+    // Neither another process nor another thread of this one writes to the same file.
+    static SERIAL: AtomicU64 = AtomicU64::new(0);
     let mut part = PathBuf::from(path);
     part.set_file_name(format!(
-        ".{}.{}.part",
+        ".{}.{}.{}.part",
         name.to_string_lossy(),
-        std::process::id()
+        std::process::id(),
+        SERIAL.fetch_add(1, Ordering::Relaxed)
     ));
     let done = write(&part).and_then(|()| fs::rename(&part, path).map_err(|e| e.to_string()));
     done.map_err(|reason| {

@@ -4,7 +4,7 @@
 //! threads; their sums are merged in that order. So one seed gives one image, bit for bit.
 
 use pss_guide::Guide;
-use pss_render::math::luminance;
+use pss_render::math::{Rgb, luminance};
 use pss_render::{Accumulator, Film, Paths, Tile, Tracer, Uniform};
 use pss_rng::{Purpose, Stream, to_unit};
 use rayon::prelude::*;
@@ -262,27 +262,24 @@ impl PassContext<'_> {
         }
         let [width, height] = film.crop_size().map(|n| n as f32);
         for (i, &[_, thin]) in coins.iter().enumerate() {
-            let mut estimate = mixture.divide(
+            let mut f = paths.f(i);
+            let (mut estimate, weight) = mixture.divide(
                 paths.f_nee[i],
                 paths.q_nee[i],
                 paths.f_bsdf[i],
                 paths.q_bsdf[i],
             );
             if !estimate.is_finite() {
+                // Counts as a path without light, here as in the tracer.
                 piece.result.statistics.counts.non_finite += 1;
-                estimate = pss_render::math::Rgb::ZERO;
+                (f, estimate) = (Rgb::ZERO, Rgb::ZERO);
             }
             piece
                 .sums
                 .add(film, paths.film[i], estimate, paths.found[i]);
-            let f = paths.f(i);
-            if f == pss_render::math::Rgb::ZERO {
+            if f == Rgb::ZERO {
                 continue;
             }
-            let weight = 1.0
-                / mixture
-                    .density(paths.q_nee[i])
-                    .min(mixture.density(paths.q_bsdf[i]));
             piece.result.statistics.add_estimate(estimate, weight);
             if thin < pass.record {
                 let r = &mut piece.result.records;

@@ -128,6 +128,18 @@ impl RealNvpOptions {
         )
     }
 
+    /// Seconds of training that each path given costs on one core, roughly: a step forward and back is six
+    /// operations a parameter and row, at the 32 GFLOP/s that `examples/guide_cost.rs` shows for this size.
+    /// 0 where the size of the training set is fixed by `samples`.
+    pub(crate) fn seconds_per_path(&self, dims: usize) -> f64 {
+        if self.samples.is_some() {
+            return 0.0;
+        }
+        let network = self.hidden * (self.hidden * (self.layers - 1) + 2 * dims);
+        let parameters = 2 * self.couplings * network;
+        6.0 * (parameters * self.epochs) as f64 / 32e9
+    }
+
     /// Rows of the training set drawn from `usable` paths.
     pub(crate) fn training_rows(&self, usable: usize) -> usize {
         self.samples.unwrap_or(usable.min(DEFAULT_SAMPLES))

@@ -132,8 +132,9 @@ impl Builder<'_> {
         if id < self.materials.bsdfs.len() {
             Ok(id)
         } else {
-            Err(SceneError::Recursion {
+            Err(SceneError::Nested {
                 id: self.id.clone(),
+                nested: id,
             })
         }
     }

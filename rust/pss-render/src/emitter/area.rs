@@ -73,4 +73,8 @@ impl EmitterModel for Area {
             _ => Rgb::ZERO,
         }
     }
+
+    fn shape(&self) -> Option<usize> {
+        Some(self.shape)
+    }
 }

@@ -55,6 +55,11 @@ pub(crate) trait EmitterModel {
     fn can_be_hit(&self) -> bool {
         true
     }
+
+    /// The shape that it sits on.
+    fn shape(&self) -> Option<usize> {
+        None
+    }
 }
 
 /// What an emitter's parts refer to, checked while the scene is built.

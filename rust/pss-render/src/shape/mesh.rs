@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use embree4::{GeomId, Hit, Ray, SceneBuilder};
+use embree4::{EmbreeError, GeomId, Hit, Ray, SceneBuilder};
 use glam::Vec2;
 use serde::Deserialize;
 
@@ -144,8 +144,8 @@ fn texcoord(texcoords: &[f32], i: usize) -> Vec2 {
 }
 
 impl ShapeModel for Mesh {
-    fn attach(&self, builder: &mut SceneBuilder) -> Result<GeomId, SceneError> {
-        Ok(builder.triangles(&*self.positions, &*self.faces)?)
+    fn attach(&self, builder: &mut SceneBuilder) -> Result<GeomId, EmbreeError> {
+        builder.triangles(&*self.positions, &*self.faces)
     }
 
     #[inline]

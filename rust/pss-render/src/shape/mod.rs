@@ -1,7 +1,7 @@
 //! Shapes: geometry for Embree, shading points, and sampling of their surfaces as Mitsuba does it.
 //! A new one is a file here and a line in the registry below.
 
-use embree4::{GeomId, Hit, Ray, SceneBuilder};
+use embree4::{EmbreeError, GeomId, Hit, Ray, SceneBuilder};
 use glam::Vec2;
 use serde::Deserialize;
 
@@ -29,7 +29,7 @@ pub struct SurfaceSample {
 /// What each shape file provides.
 pub(crate) trait ShapeModel {
     /// Hands the geometry to Embree.
-    fn attach(&self, builder: &mut SceneBuilder) -> Result<GeomId, SceneError>;
+    fn attach(&self, builder: &mut SceneBuilder) -> Result<GeomId, EmbreeError>;
 
     /// The surface at a hit; `shape` is filled in by the caller.
     fn interaction(&self, ray: &Ray, hit: &Hit) -> Interaction;

@@ -2,7 +2,7 @@
 
 use std::f32::consts::{PI, TAU};
 
-use embree4::{GeomId, Hit, Quadric, Ray, SceneBuilder};
+use embree4::{EmbreeError, GeomId, Hit, Quadric, Ray, SceneBuilder};
 use glam::Vec2;
 use serde::Deserialize;
 
@@ -91,11 +91,11 @@ impl Sphere {
 }
 
 impl ShapeModel for Sphere {
-    fn attach(&self, builder: &mut SceneBuilder) -> Result<GeomId, SceneError> {
-        Ok(builder.quadric(Quadric::Sphere {
+    fn attach(&self, builder: &mut SceneBuilder) -> Result<GeomId, EmbreeError> {
+        builder.quadric(Quadric::Sphere {
             center: self.center.to_array(),
             radius: self.radius,
-        })?)
+        })
     }
 
     fn interaction(&self, ray: &Ray, hit: &Hit) -> Interaction {
@@ -134,14 +134,9 @@ impl ShapeModel for Sphere {
         let inverse_distance = 1.0 / distance_2.sqrt();
         let sin_max = self.radius * inverse_distance;
         let sin_max_2 = sin_max * sin_max;
-        let cos_max = safe_sqrt(1.0 - sin_max_2);
-        // Below 1.5° the difference of cosines cancels; its Taylor series does not.
-        let sin_2 = if sin_max_2 > 0.000_685_23 {
-            let c = 1.0 + (cos_max - 1.0) * u[0];
-            1.0 - c * c
-        } else {
-            sin_max_2 * u[0]
-        };
+        // 1 − cos θ is uniform on the cone's cap; kept as it is, it does not cancel for a small cone.
+        let below_one = cone_depth(sin_max_2) * u[0];
+        let sin_2 = below_one * (2.0 - below_one);
         let cos_theta = safe_sqrt(1.0 - sin_2);
         let cos_alpha =
             sin_2 / sin_max + cos_theta * safe_sqrt(1.0 - sin_2 / sin_max_2);
@@ -155,19 +150,29 @@ impl ShapeModel for Sphere {
             p,
             n: d * self.sign,
             uv: Self::uv(self.map.inverse_point(p)),
-            pdf: if p == reference { 0.0 } else { uniform_cone_pdf(cos_max) },
+            pdf: if p == reference {
+                0.0
+            } else {
+                uniform_cone_pdf(cone_depth(sin_max_2))
+            },
         }
     }
 
     fn pdf_direction(&self, reference: Vec3, p: Vec3, n: Vec3) -> f32 {
         let distance_2 = (self.center - reference).length_squared();
         if self.is_outside(distance_2) {
-            let sin_2 = self.radius * self.radius / distance_2;
-            uniform_cone_pdf(safe_sqrt(1.0 - sin_2))
+            uniform_cone_pdf(cone_depth(self.radius * self.radius / distance_2))
         } else {
             solid_angle_pdf(1.0 / self.area(), p - reference, n)
         }
     }
+}
+
+/// 1 − cos θ of the cone of half-angle θ, from sin² θ; Mitsuba subtracts, and so loses distant small lamps.
+fn cone_depth(sin_2: f32) -> f32 {
+    // From a point on the sphere rounding may find a sine above 1.
+    let sin_2 = sin_2.min(1.0);
+    sin_2 / (1.0 + safe_sqrt(1.0 - sin_2))
 }
 
 /// The basis about a unit vector that Mitsuba uses where no uv frame is at hand (Duff et al. 2017).
@@ -179,4 +184,44 @@ fn mitsuba_basis(n: Vec3) -> (Vec3, Vec3) {
         Vec3::new(sign * n.x * n.x * a + 1.0, sign * b, -sign * n.x),
         Vec3::new(b, n.y * n.y * a + sign, -n.y),
     )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_small_distant_lamp_keeps_its_density() {
+        for (radius, distance) in [(1.0f32, 2.0f32), (1.0, 50.0), (0.01, 100.0), (1e-3, 1e4)] {
+            let lamp = Sphere {
+                center: Vec3::new(0.0, 0.0, distance),
+                radius,
+                map: Affine {
+                    to_world: glam::Affine3A::IDENTITY,
+                    to_object: glam::Affine3A::IDENTITY,
+                },
+                sign: 1.0,
+            };
+            let sin_2 = (f64::from(radius) / f64::from(distance)).powi(2);
+            let truth = 1.0 / (std::f64::consts::TAU * (1.0 - (1.0 - sin_2).sqrt()));
+            // The difference of the two cosines cancels in the truth as well.
+            let truth = if sin_2 < 1e-6 {
+                1.0 / (std::f64::consts::PI * sin_2)
+            } else {
+                truth
+            };
+            for u in [[0.0, 0.0], [0.3, 0.7], [0.999, 0.5]] {
+                let s = lamp.sample_direction(Vec3::ZERO, u);
+                assert!(
+                    (f64::from(s.pdf) / truth - 1.0).abs() < 1e-5,
+                    "{radius} {distance}: {} ≠ {truth}",
+                    s.pdf
+                );
+                let again = lamp.pdf_direction(Vec3::ZERO, s.p, s.n);
+                assert!((s.pdf / again - 1.0).abs() < 1e-6, "{} ≠ {again}", s.pdf);
+                // On the side that faces the reference point.
+                assert!((s.p - lamp.center).z <= 0.0);
+            }
+        }
+    }
 }

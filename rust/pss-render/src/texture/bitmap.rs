@@ -32,10 +32,13 @@ pub(crate) struct Description {
     to_uv: [f32; 9],
     wrap: Wrap,
     filter: Filter,
-    #[serde(default)]
-    #[allow(dead_code)]
-    mean: f32,
+    /// Mitsuba's mean of the texture; nothing here needs it yet.
+    #[serde(default, rename = "mean")]
+    _mean: f32,
 }
+
+/// Largest edge in texels; indices are `i32`.
+const LARGEST: usize = 1 << 30;
 
 /// Pixels in rows from v = 0 downwards, as Mitsuba stores them; one or three channels.
 #[derive(Debug)]
@@ -55,7 +58,12 @@ impl Bitmap {
         let owner = format!("texture {:?}", d.id);
         let (shape, data) = arrays.take_any_f32(d.data, &owner, "data")?;
         let (height, width, channels) = match shape[..] {
-            [h, w, c] if h > 0 && w > 0 && (c == 1 || c == 3) && h * w * c == data.len() => {
+            [h, w, c]
+                if (1..=LARGEST).contains(&h)
+                    && (1..=LARGEST).contains(&w)
+                    && (c == 1 || c == 3)
+                    && h.checked_mul(w).and_then(|n| n.checked_mul(c)) == Some(data.len()) =>
+            {
                 (h, w, c)
             }
             _ => {
@@ -131,5 +139,29 @@ impl TextureModel for Bitmap {
     fn eval_scalar(&self, uv: Vec2) -> f32 {
         let value = self.eval(uv);
         if self.channels == 1 { value.x } else { luminance(value) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn indices_wrap_on_both_sides() {
+        let wrapped = |wrap| -> Vec<usize> {
+            let bitmap = Bitmap {
+                data: vec![0.0; 3],
+                width: 3,
+                height: 1,
+                channels: 1,
+                to_uv: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]],
+                wrap,
+                filter: Filter::Nearest,
+            };
+            (-4..8).map(|i| bitmap.wrap(i, 3)).collect()
+        };
+        assert_eq!(wrapped(Wrap::Repeat), [2, 0, 1, 2, 0, 1, 2, 0, 1, 2, 0, 1]);
+        assert_eq!(wrapped(Wrap::Mirror), [2, 2, 1, 0, 0, 1, 2, 2, 1, 0, 0, 1]);
+        assert_eq!(wrapped(Wrap::Clamp), [0, 0, 0, 0, 0, 1, 2, 2, 2, 2, 2, 2]);
     }
 }
