@@ -6,6 +6,7 @@
 | `furnace_sphere` | 32 × 32, box                | cube, sphere, disk, cylinder | diffuse          | area (sphere)  |
 | `glossy_room`    | 48 × 32 of 64 × 48, Gauss   | rectangle, cube, sphere      | every glossy one | point, area    |
 | `open_sky`       | 48 × 48, tent               | rectangle, cube, sphere      | diffuse          | constant, area |
+| `glass_room`     | 32 × 32, box                | rectangle, sphere, cube      | every delta one  | constant, area |
 
 Set a Mitsuba variant before calling a factory: transforms and bitmaps belong to one. Film sizes are multiples of 16,
 the side of a tile in the statistical tests.
@@ -232,11 +233,86 @@ def open_sky() -> Description:
     }
 
 
+def glass_room() -> Description:
+    """Mirrors, panes, smooth and rough glass and masks on a coated floor: NEE alone misses their light.
+
+    The lights are large, so that no single path through the glass holds a good part of the image.
+    """
+    T = mi.ScalarTransform4f
+    glass = {"type": "dielectric", "int_ior": 1.5}
+    return {
+        "type": "scene",
+        "camera": _camera(
+            origin=(2.2, -2.9, 1.6), target=(-0.1, 0.2, 0.5), fov=48, film=_film(32, 32, "box")
+        ),
+        "floor": {
+            "type": "rectangle",
+            "to_world": T().scale(2.0),
+            "bsdf": {"type": "plastic", "diffuse_reflectance": _checks(), "nonlinear": True},
+        },
+        "back": {
+            "type": "rectangle",
+            "to_world": T().translate([0, 2, 1.5]).rotate([1, 0, 0], 90).scale([2, 1.5, 1]),
+            "bsdf": {"type": "conductor", "specular_reflectance": _rgb(0.8, 0.75, 0.7)},
+        },
+        "side": {
+            "type": "rectangle",
+            "to_world": T().translate([-2, 0, 1.5]).rotate([0, 1, 0], 90).scale([1.5, 2, 1]),
+            "bsdf": _twosided({"type": "plastic", "diffuse_reflectance": _rgb(0.3, 0.5, 0.4)}),
+        },
+        "ball": {"type": "sphere", "center": [-0.6, 0.5, 0.55], "radius": 0.5, "bsdf": glass},
+        "frosted": {
+            "type": "sphere",
+            "center": [0.7, 0.9, 0.45],
+            "radius": 0.4,
+            "bsdf": {"type": "roughdielectric", "distribution": "ggx", "alpha": 0.3},
+        },
+        "pane": {
+            "type": "rectangle",
+            "to_world": T().translate([1.1, -0.2, 0.5]).rotate([0, 1, 0], 70).scale([0.5, 0.6, 1]),
+            "bsdf": {"type": "thindielectric", "specular_transmittance": _rgb(0.7, 0.9, 0.8)},
+        },
+        "leaf": {
+            "type": "rectangle",
+            "to_world": T().translate([0, -0.9, 0.6]).rotate([1, 0, 0], 65).scale([0.7, 0.5, 1]),
+            "bsdf": {
+                "type": "mask",
+                "opacity": 0.55,
+                "nested": _twosided(_diffuse(0.7, 0.4, 0.2)),
+            },
+        },
+        "veil": {
+            "type": "rectangle",
+            "to_world": T().translate([-1.2, -0.8, 0.5]).rotate([1, 0, 0], 90).scale(0.5),
+            "bsdf": {
+                "type": "mask",
+                "opacity": 0.7,
+                "nested": _twosided(
+                    {"type": "plastic", "diffuse_reflectance": _rgb(0.6, 0.2, 0.4)}
+                ),
+            },
+        },
+        "ghost": {
+            "type": "cube",
+            "to_world": T().translate([0.1, 1.2, 1.4]).scale(0.3),
+            "bsdf": {"type": "null"},
+        },
+        "lamp": {
+            "type": "rectangle",
+            "to_world": T().translate([0, 0, 3]).rotate([1, 0, 0], 180).scale(1.5),
+            "bsdf": _diffuse(0.0),
+            "light": _area(2.0, 1.9, 1.7),
+        },
+        "sky": {"type": "constant", "radiance": _rgb(0.4, 0.5, 0.6)},
+    }
+
+
 SCENES: dict[str, Callable[[], Description]] = {
     "quad": quad,
     "furnace_sphere": furnace_sphere,
     "glossy_room": glossy_room,
     "open_sky": open_sky,
+    "glass_room": glass_room,
 }
 """Every scene of this file by name; a test over all scenes iterates over this."""
 

@@ -137,8 +137,17 @@ class Scene:
         """Per ray: valid (n,), p, n, sh_n (n,3), uv (n,2), shape (n,) index, sh_s (n,3) uv-frame tangent."""
     def bsdf_eval_pdf(self, bsdf: int, uv: F32, wi: F32, wo: F32) -> tuple[F32, F32]:
         """Local directions (z = normal): value·cos (n,3) and pdf (n,)."""
-    def bsdf_sample(self, bsdf: int, uv: F32, wi: F32, u: F32) -> tuple[F32, F32, F32]:
-        """Returns wo (n,3), weight (n,3), pdf (n,); pdf 0 where nothing was sampled."""
+    def bsdf_sample(
+        self, bsdf: int, uv: F32, wi: F32, u: F32
+    ) -> tuple[F32, F32, F32, NDArray[np.bool_]]:
+        """Returns wo (n,3), weight (n,3), pdf (n,), delta (n,); pdf 0 where nothing was sampled.
+
+        Where `delta` is set, pdf is the lobe's probability.
+        """
+    def bsdf_sample_delta(
+        self, bsdf: int, uv: F32, wi: F32, u: F32
+    ) -> tuple[F32, tuple[F32, F32, F32, NDArray[np.bool_]]]:
+        """Delta lobes alone, from one number each: their probability (n,), and what `bsdf_sample` returns."""
     def texture_eval(self, texture: int, uv: F32) -> F32: ...
     def emitter_sample(self, emitter: int, reference: F32, u: F32) -> dict[str, NDArray[Any]]:
         """Returns d (n,3), radiance (n,3), pdf (n,) (0: none), p (n,3)."""

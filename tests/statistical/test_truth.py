@@ -30,10 +30,10 @@ pytestmark = [pytest.mark.stat, pytest.mark.timeout(600)]
 RUNS, SPP = 16, 32
 SHIPPED = ("cornell-box", "teapot")
 """Reduced to 64 × 64 pixels."""
-SMALL = ("furnace_sphere", "glossy_room", "open_sky")
+SMALL = ("furnace_sphere", "glossy_room", "open_sky", "glass_room")
 """`quad` has a test of its own: its two-bounce light is zero."""
-BLIND = ()
-"""Scenes where NEE alone misses light, at a mirror say, so that strategy `nee` is not right: none yet."""
+BLIND = ("glass_room",)
+"""Scenes where NEE alone misses light, at a mirror say, so that strategy `nee` is not right."""
 
 
 def _load(name: str) -> mi.Scene:
@@ -62,6 +62,7 @@ def _cases() -> list[Any]:
     quick = {
         *((name, 2, "bsdf", "mis") for name in (*SHIPPED, *SMALL)),
         *((name, 2, p, "mis") for name in ("teapot", "glossy_room") for p in ("cosine", "uniform")),
+        *product(("glass_room",), (2, 3), ("bsdf", "cosine", "uniform"), ("mis",)),
         *((name, 2, "bsdf", "nee") for name in SHIPPED),
         *((name, 1, "bsdf", "mis") for name in ("glossy_room", "open_sky")),
         *((name, 3, "bsdf", "mis") for name in ("cornell-box", "furnace_sphere")),

@@ -36,7 +36,39 @@ def _blendbsdf(walk: Walk, obj: Any, where: str) -> Entry:
     }
 
 
-def _roughplastic(walk: Walk, obj: Any, where: str) -> Entry:
+def _mask(walk: Walk, obj: Any, where: str) -> Entry:
+    fields = Fields(obj)
+    return {
+        "opacity": _texture(walk, fields, where, "opacity"),
+        "nested": export_bsdf(walk, fields["nested_bsdf"], f"{where}.nested_bsdf"),
+    }
+
+
+def _null(_walk: Walk, _obj: Any, _where: str) -> Entry:
+    return {}
+
+
+def _conductor(walk: Walk, obj: Any, where: str) -> Entry:
+    fields = Fields(obj)
+    return {
+        "eta": _texture(walk, fields, where, "eta"),
+        "k": _texture(walk, fields, where, "k"),
+        "specular_reflectance": _optional_texture(walk, fields, where, "specular_reflectance"),
+    }
+
+
+def _dielectric(walk: Walk, obj: Any, where: str) -> Entry:
+    """`dielectric` and `thindielectric`."""
+    fields = Fields(obj)
+    return {
+        "int_ior_over_ext_ior": number(fields["eta"], "eta"),
+        "specular_reflectance": _optional_texture(walk, fields, where, "specular_reflectance"),
+        "specular_transmittance": _optional_texture(walk, fields, where, "specular_transmittance"),
+    }
+
+
+def _coat(walk: Walk, obj: Any, where: str) -> Entry:
+    """What `plastic` and `roughplastic` share."""
     fields, shown = Fields(obj), printed(obj)
     diffuse_mean = number(fields["diffuse_reflectance"].mean(), "diffuse_reflectance")
     specular_mean = 1.0
@@ -45,9 +77,6 @@ def _roughplastic(walk: Walk, obj: Any, where: str) -> Entry:
     # Mitsuba keeps this number to itself but renews it with every edit, from the same means.
     total = diffuse_mean + specular_mean
     return {
-        "distribution": switch(shown, "distribution", DISTRIBUTIONS),
-        "alpha": number(fields["alpha"], "alpha"),
-        "sample_visible": switch(shown, "sample_visible", SWITCH),
         "nonlinear": switch(shown, "nonlinear", SWITCH),
         "int_ior_over_ext_ior": number(fields["eta"], "eta"),
         "diffuse_reflectance": _texture(walk, fields, where, "diffuse_reflectance"),
@@ -56,7 +85,18 @@ def _roughplastic(walk: Walk, obj: Any, where: str) -> Entry:
     }
 
 
-def _roughconductor(walk: Walk, obj: Any, where: str) -> Entry:
+def _roughplastic(walk: Walk, obj: Any, where: str) -> Entry:
+    shown = printed(obj)
+    return {
+        "distribution": switch(shown, "distribution", DISTRIBUTIONS),
+        "alpha": number(Fields(obj)["alpha"], "alpha"),
+        "sample_visible": switch(shown, "sample_visible", SWITCH),
+        **_coat(walk, obj, where),
+    }
+
+
+def _microfacets(walk: Walk, obj: Any, where: str) -> Entry:
+    """What `roughconductor` and `roughdielectric` share."""
     fields, shown = Fields(obj), printed(obj)
     isotropic = "alpha" in fields
     return {
@@ -64,14 +104,26 @@ def _roughconductor(walk: Walk, obj: Any, where: str) -> Entry:
         "sample_visible": switch(shown, "sample_visible", SWITCH),
         "alpha_u": _texture(walk, fields, where, "alpha" if isotropic else "alpha_u"),
         "alpha_v": _texture(walk, fields, where, "alpha" if isotropic else "alpha_v"),
-        "eta": _texture(walk, fields, where, "eta"),
-        "k": _texture(walk, fields, where, "k"),
-        "specular_reflectance": _optional_texture(walk, fields, where, "specular_reflectance"),
     }
+
+
+def _roughconductor(walk: Walk, obj: Any, where: str) -> Entry:
+    return _microfacets(walk, obj, where) | _conductor(walk, obj, where)
+
+
+def _roughdielectric(walk: Walk, obj: Any, where: str) -> Entry:
+    return _microfacets(walk, obj, where) | _dielectric(walk, obj, where)
 
 
 BSDFS: dict[str, Converter] = {
     "SmoothDiffuse": Converter("diffuse", "diffuse", _diffuse),
+    "SmoothConductor": Converter("conductor", "conductor", _conductor),
+    "SmoothDielectric": Converter("dielectric", "dielectric", _dielectric),
+    "ThinDielectric": Converter("thindielectric", "thindielectric", _dielectric),
+    "RoughDielectric": Converter("roughdielectric", "roughdielectric", _roughdielectric),
+    "SmoothPlastic": Converter("plastic", "plastic", _coat),
+    "MaskBSDF": Converter("mask", "mask", _mask),
+    "Null": Converter("null", "null", _null),
     "TwoSidedBRDF": Converter("twosided", "twosided", _twosided),
     "BlendBSDF": Converter("blendbsdf", "blendbsdf", _blendbsdf),
     "RoughPlastic": Converter("roughplastic", "roughplastic", _roughplastic),

@@ -82,6 +82,34 @@ impl ShadingPoint<'_> {
     }
 }
 
+/// A number that chose the part [from, from + width) of [0, 1), stretched over [0, 1) to be used again.
+#[inline]
+pub(crate) fn reuse(u: f32, from: f32, width: f32) -> f32 {
+    ((u - from) / width).clamp(0.0, 1.0 - f32::EPSILON / 2.0)
+}
+
+/// A delta lobe; `None` where its weight or probability is zero.
+#[inline]
+fn delta_lobe(wo: Vec3, weight: Rgb, probability: f32) -> Option<BsdfSample> {
+    (probability > 0.0).then_some(BsdfSample {
+        wo,
+        weight,
+        pdf: probability,
+        delta: true,
+    })
+}
+
+/// Whether a roughness along u and one along v may differ, so that the azimuth matters.
+fn alphas_differ(m: &Materials, alpha_u: TextureId, alpha_v: TextureId) -> bool {
+    match (m.texture(alpha_u), m.texture(alpha_v)) {
+        _ if alpha_u == alpha_v => false,
+        (u @ Texture::Constant(_), v @ Texture::Constant(_)) => {
+            u.eval_scalar(Vec2::ZERO) != v.eval_scalar(Vec2::ZERO)
+        }
+        _ => true,
+    }
+}
+
 /// What each BSDF file provides.
 pub(crate) trait BsdfModel {
     /// Draws `wo`; the lobe is chosen from `u[0]`, which is then rescaled and reused. `None`: the
@@ -91,8 +119,24 @@ pub(crate) trait BsdfModel {
     /// f·|cos θ_o| and the density of [`BsdfModel::sample`] in solid angle, delta lobes left out.
     fn eval_pdf(&self, at: ShadingPoint<'_>, wi: Vec3, wo: Vec3) -> (Rgb, f32);
 
-    /// Whether it carries light to the other side.
+    /// Probability that [`BsdfModel::sample`] takes a delta lobe.
+    fn delta_probability(&self, _at: ShadingPoint<'_>, _wi: Vec3) -> f32 {
+        0.0
+    }
+
+    /// Draws among the delta lobes alone, in proportion to their probabilities, from one number in [0, 1).
+    /// Weight and probability are those of [`BsdfModel::sample`].
+    fn sample_delta(&self, _at: ShadingPoint<'_>, _wi: Vec3, _u: f32) -> Option<BsdfSample> {
+        None
+    }
+
+    /// Whether a smooth lobe carries light to the other side.
     fn transmits(&self, _materials: &Materials) -> bool {
+        false
+    }
+
+    /// Whether anything happens for `wi` below the surface.
+    fn two_sided(&self, _materials: &Materials) -> bool {
         false
     }
 
@@ -195,9 +239,27 @@ macro_rules! registry {
                 match self { $(Self::$variant(b) => b.eval_pdf(at, wi, wo),)* }
             }
 
-            /// Whether it carries light to the other side.
+            /// Probability that [`Bsdf::sample`] takes a delta lobe.
+            #[inline]
+            pub fn delta_probability(&self, at: ShadingPoint<'_>, wi: Vec3) -> f32 {
+                match self { $(Self::$variant(b) => b.delta_probability(at, wi),)* }
+            }
+
+            /// Draws among the delta lobes alone from one number; weight and probability are those of
+            /// [`Bsdf::sample`]. `None` ends the path.
+            #[inline]
+            pub fn sample_delta(&self, at: ShadingPoint<'_>, wi: Vec3, u: f32) -> Option<BsdfSample> {
+                match self { $(Self::$variant(b) => b.sample_delta(at, wi, u),)* }
+            }
+
+            /// Whether a smooth lobe carries light to the other side.
             pub fn transmits(&self, materials: &Materials) -> bool {
                 match self { $(Self::$variant(b) => b.transmits(materials),)* }
+            }
+
+            /// Whether anything happens for `wi` below the surface.
+            pub fn two_sided(&self, materials: &Materials) -> bool {
+                match self { $(Self::$variant(b) => b.two_sided(materials),)* }
             }
 
             /// Whether any lobe is smooth, so that NEE can join it.
@@ -223,8 +285,15 @@ macro_rules! registry {
 
 registry! {
     "blendbsdf" => BlendBsdf in blendbsdf;
+    "conductor" => Conductor in conductor;
+    "dielectric" => Dielectric in dielectric;
     "diffuse" => Diffuse in diffuse;
+    "mask" => Mask in mask;
+    "null" => Null in null;
+    "plastic" => Plastic in plastic;
     "roughconductor" => RoughConductor in roughconductor;
+    "roughdielectric" => RoughDielectric in roughdielectric;
     "roughplastic" => RoughPlastic in roughplastic;
+    "thindielectric" => ThinDielectric in thindielectric;
     "twosided" => TwoSided in twosided;
 }
