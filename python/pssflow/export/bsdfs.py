@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
+from .perturbed import switches
 from .textures import export_texture
 from .walk import SWITCH, Converter, Entry, Fields, Walk, number, printed, switch
 
@@ -115,6 +117,56 @@ def _roughdielectric(walk: Walk, obj: Any, where: str) -> Entry:
     return _microfacets(walk, obj, where) | _dielectric(walk, obj, where)
 
 
+def _normalmap(walk: Walk, obj: Any, where: str) -> Entry:
+    fields = Fields(obj)
+    nested, texture = fields["nested_bsdf"], fields["normalmap"]
+    flip, soften = switches(obj, nested, texture)
+    return {
+        "nested": export_bsdf(walk, nested, f"{where}.nested_bsdf"),
+        "normalmap": _texture(walk, fields, where, "normalmap"),
+        "flip_invalid_normals": flip,
+        "use_shadowing_function": soften,
+    }
+
+
+DISNEY = (
+    *("base_color", "roughness", "anisotropic", "spec_trans", "spec_tint"),
+    *("sheen", "sheen_tint", "flatness"),
+)
+"""Textures that `principled` and `principledthin` share."""
+
+
+def _principled(walk: Walk, obj: Any, where: str) -> Entry:
+    fields = Fields(obj)
+    if "eta" in fields:
+        eta = number(fields["eta"], "eta")
+    else:
+        eta = 2 / (1 - (0.08 * number(fields["specular"], "specular")) ** 0.5) - 1
+    textures = (*DISNEY, "metallic", "clearcoat", "clearcoat_gloss")
+    rates = ("main_specular", "clearcoat", "diffuse_reflectance")
+    return {
+        "eta": eta,
+        **{name: _texture(walk, fields, where, name) for name in textures},
+        **_rates(fields, rates),
+    }
+
+
+def _principledthin(walk: Walk, obj: Any, where: str) -> Entry:
+    fields = Fields(obj)
+    textures = (*DISNEY, "eta", "diff_trans")
+    rates = [
+        f"{kind}_{way}"
+        for kind in ("specular", "diffuse")
+        for way in ("reflectance", "transmittance")
+    ]
+    return {name: _texture(walk, fields, where, name) for name in textures} | _rates(fields, rates)
+
+
+def _rates(fields: Fields, names: Iterable[str]) -> Entry:
+    keys = (f"{name}_sampling_rate" for name in names)
+    return {key: number(fields[key], key) for key in keys}
+
+
 BSDFS: dict[str, Converter] = {
     "SmoothDiffuse": Converter("diffuse", "diffuse", _diffuse),
     "SmoothConductor": Converter("conductor", "conductor", _conductor),
@@ -124,6 +176,9 @@ BSDFS: dict[str, Converter] = {
     "SmoothPlastic": Converter("plastic", "plastic", _coat),
     "MaskBSDF": Converter("mask", "mask", _mask),
     "Null": Converter("null", "null", _null),
+    "NormalMap": Converter("normalmap", "normalmap", _normalmap),
+    "Principled": Converter("principled", "principled", _principled),
+    "PrincipledThin": Converter("principledthin", "principledthin", _principledthin),
     "TwoSidedBRDF": Converter("twosided", "twosided", _twosided),
     "BlendBSDF": Converter("blendbsdf", "blendbsdf", _blendbsdf),
     "RoughPlastic": Converter("roughplastic", "roughplastic", _roughplastic),

@@ -11,8 +11,10 @@ use crate::error::SceneError;
 use crate::math::{Rgb, Vec3};
 use crate::texture::{Texture, TextureId};
 
+mod disney;
 mod fresnel;
 mod microfacet;
+mod perturbed;
 
 /// Index into the scene's BSDFs.
 pub type BsdfId = usize;
@@ -289,8 +291,11 @@ registry! {
     "dielectric" => Dielectric in dielectric;
     "diffuse" => Diffuse in diffuse;
     "mask" => Mask in mask;
+    "normalmap" => NormalMap in normalmap;
     "null" => Null in null;
     "plastic" => Plastic in plastic;
+    "principled" => Principled in principled;
+    "principledthin" => PrincipledThin in principledthin;
     "roughconductor" => RoughConductor in roughconductor;
     "roughdielectric" => RoughDielectric in roughdielectric;
     "roughplastic" => RoughPlastic in roughplastic;
