@@ -217,15 +217,44 @@ impl Scene {
         Ok(dict)
     }
 
-    /// Camera rays through film positions: (origins, directions).
+    /// What rays see of an emitter, and its density at each: the surface that they meet, where it is one.
+    fn emitter_eval_pdf(
+        &self,
+        py: Python<'_>,
+        emitter: usize,
+        reference: PyReadonlyArray2<'_, f32>,
+        directions: PyReadonlyArray2<'_, f32>,
+    ) -> PyResult<(Py<PyAny>, Py<PyAny>)> {
+        let emitter = index("emitter", emitter, self.inner.emitters().len())?;
+        let reference = arrays::rows::<3>(&reference, "reference")?;
+        let directions = arrays::rows::<3>(&directions, "directions")?;
+        arrays::same_rows("directions", directions.len(), reference.len())?;
+        let (values, pdfs): (Vec<Rgb>, Vec<f32>) = reference
+            .iter()
+            .zip(&directions)
+            .map(|(p, d)| self.inner.eval_emitter(emitter, *p, *d))
+            .unzip();
+        Ok((arrays::to_rows3(py, &values)?, arrays::to_vector(py, pdfs)))
+    }
+
+    /// Camera rays through film positions and points of the lens, its centre by default: (origins, directions).
+    #[pyo3(signature = (pixels, lens=None))]
     fn film_ray(
         &self,
         py: Python<'_>,
         pixels: PyReadonlyArray2<'_, f32>,
+        lens: Option<PyReadonlyArray2<'_, f32>>,
     ) -> PyResult<(Py<PyAny>, Py<PyAny>)> {
-        let rays: Vec<_> = arrays::rows::<2>(&pixels, "pixels")?
+        let pixels = arrays::rows::<2>(&pixels, "pixels")?;
+        let lens = match lens {
+            Some(lens) => arrays::rows::<2>(&lens, "lens")?,
+            None => vec![[0.5; 2]; pixels.len()],
+        };
+        arrays::same_rows("lens", lens.len(), pixels.len())?;
+        let rays: Vec<_> = pixels
             .into_iter()
-            .map(|p| self.inner.sensor().ray(p))
+            .zip(lens)
+            .map(|(p, lens)| self.inner.sensor().ray(p, lens))
             .collect();
         let origins: Vec<Vec3> = rays.iter().map(|r| Vec3::from_array(r.origin)).collect();
         let directions: Vec<Vec3> = rays.iter().map(|r| Vec3::from_array(r.dir)).collect();

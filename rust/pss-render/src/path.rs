@@ -185,10 +185,10 @@ impl<'a> Tracer<'a> {
 
     fn camera_rays(&self, paths: &mut Paths) {
         let sensor = self.scene.sensor();
-        let film = &paths.film;
+        let (film, lens) = (&paths.film, &paths.lens);
         paths.states.clear();
-        paths.states.extend(film.iter().map(|&position| State {
-            ray: sensor.ray(position),
+        paths.states.extend(film.iter().enumerate().map(|(i, &position)| State {
+            ray: sensor.ray(position, lens.get(i).copied().unwrap_or([0.5; 2])),
             throughput: Rgb::ONE,
             si: Interaction::default(),
             frame: Frame::default(),

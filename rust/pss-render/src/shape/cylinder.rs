@@ -53,7 +53,7 @@ impl Cylinder {
 }
 
 impl ShapeModel for Cylinder {
-    fn attach(&self, builder: &mut SceneBuilder) -> Result<GeomId, SceneError> {
+    fn attach(&self, builder: &mut SceneBuilder, _groups: &[embree4::Scene]) -> Result<GeomId, SceneError> {
         Ok(builder.quadric(Quadric::Cylinder { to_world: self.map.rows() })?)
     }
 

@@ -53,7 +53,7 @@ impl Disk {
 }
 
 impl ShapeModel for Disk {
-    fn attach(&self, builder: &mut SceneBuilder) -> Result<GeomId, SceneError> {
+    fn attach(&self, builder: &mut SceneBuilder, _groups: &[embree4::Scene]) -> Result<GeomId, SceneError> {
         Ok(builder.quadric(Quadric::Disk { to_world: self.map.rows() })?)
     }
 

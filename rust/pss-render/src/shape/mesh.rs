@@ -144,7 +144,7 @@ fn texcoord(texcoords: &[f32], i: usize) -> Vec2 {
 }
 
 impl ShapeModel for Mesh {
-    fn attach(&self, builder: &mut SceneBuilder) -> Result<GeomId, SceneError> {
+    fn attach(&self, builder: &mut SceneBuilder, _groups: &[embree4::Scene]) -> Result<GeomId, SceneError> {
         Ok(builder.triangles(&*self.positions, &*self.faces)?)
     }
 

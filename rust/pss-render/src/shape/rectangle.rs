@@ -62,8 +62,8 @@ impl Rectangle {
 }
 
 impl ShapeModel for Rectangle {
-    fn attach(&self, builder: &mut SceneBuilder) -> Result<GeomId, SceneError> {
-        self.mesh.attach(builder)
+    fn attach(&self, builder: &mut SceneBuilder, groups: &[embree4::Scene]) -> Result<GeomId, SceneError> {
+        self.mesh.attach(builder, groups)
     }
 
     #[inline]

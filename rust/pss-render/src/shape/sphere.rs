@@ -91,7 +91,7 @@ impl Sphere {
 }
 
 impl ShapeModel for Sphere {
-    fn attach(&self, builder: &mut SceneBuilder) -> Result<GeomId, SceneError> {
+    fn attach(&self, builder: &mut SceneBuilder, _groups: &[embree4::Scene]) -> Result<GeomId, SceneError> {
         Ok(builder.quadric(Quadric::Sphere {
             center: self.center.to_array(),
             radius: self.radius,

@@ -63,4 +63,5 @@ macro_rules! registry {
 registry! {
     "constant" => Constant in constant;
     "bitmap" => Bitmap in bitmap;
+    "checkerboard" => Checkerboard in checkerboard;
 }
