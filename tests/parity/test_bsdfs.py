@@ -80,6 +80,11 @@ def _bumpy(nested: Description, **options: Any) -> Description:
     return {"type": "normalmap", "normalmap": texture, "nested": nested} | options
 
 
+def _bumps(nested: Description, **options: Any) -> Description:
+    texture = _bitmap(32, 1) | {"to_uv": mi.ScalarTransform3f().scale([2, 3])}
+    return {"type": "bumpmap", "heights": texture, "nested": nested, "scale": 0.08} | options
+
+
 BSDFS: dict[str, Callable[[], Description]] = {
     "diffuse": lambda: {"type": "diffuse", "reflectance": _rgb(0.2, 0.5, 0.8)},
     "diffuse-textured": lambda: {"type": "diffuse", "reflectance": _bitmap(1, 3)},
@@ -237,6 +242,14 @@ BSDFS |= {
     "normalmap-glass": lambda: _bumpy(_rough_glass(alpha=0.3), use_shadowing_function=False),
     "normalmap-twosided": lambda: {"type": "twosided", "nested": _bumpy(_plastic(alpha=0.2))},
     "normalmap-coat": lambda: _bumpy(_coat()),
+    "bumpmap": lambda: _bumps({"type": "diffuse"}),
+    "bumpmap-hard": lambda: _bumps(
+        {"type": "diffuse"}, flip_invalid_normals=False, use_shadowing_function=False
+    ),
+    "bumpmap-textured": lambda: _bumps(_plastic(alpha=0.2, diffuse_reflectance=_bitmap(33, 3))),
+    "bumpmap-anisotropic": lambda: _bumps(_gold(alpha_u=0.2, alpha_v=0.4), scale=-0.05),
+    "bumpmap-twosided": lambda: {"type": "twosided", "nested": _bumps(_coat())},
+    "bumpmap-glass": lambda: _bumps(_rough_glass(alpha=0.3), use_shadowing_function=False),
     "normalmap-mask": lambda: _bumpy({"type": "mask", "opacity": 0.6, "nested": _coat()}),
 }
 
@@ -301,6 +314,7 @@ MIXED = (
     "mask-of-mask",
     "normalmap-coat",
     "normalmap-mask",
+    "bumpmap-twosided",
 )
 """Those of `BSDFS` with delta lobes beside smooth ones."""
 
@@ -386,6 +400,8 @@ def test_value_and_density_are_mitsubas(name: str, gallery: Gallery) -> None:
     grazing = np.minimum(np.abs(wi[:, 2]), np.abs(wo[:, 2])) < 0.01
     # Refraction along the microfacet: 1 − F and ωo·m both vanish, and with them the value.
     grazing |= (wi[:, 2] * wo[:, 2] < 0) & (their_value.max(axis=1) < 1e-4)
+    if name.startswith(("normalmap", "bumpmap")):
+        grazing |= their_pdf < 1e-3  # the horizon of another normal
     rows = {"uv": uv, "wi": wi, "wo": wo, "value": value, "theirs": their_value}
     rows |= {"pdf": pdf, "their_pdf": their_pdf}
     assert not (wrong & ~grazing).any(), first_rows(wrong & ~grazing, **rows)
@@ -410,6 +426,7 @@ NARROW = (
     "mask-of-mask",
     "blend-of-rough-glass",
     "normalmap-glass",
+    "bumpmap-glass",
     "disney-glass",
     "disney-all",
     "sheet",
@@ -446,7 +463,7 @@ def test_samples_follow_the_density(name: str, incident: str, gallery: Gallery) 
 
     value, again = gallery.core.bsdf_eval_pdf(bsdf, uv, wi, wo)
     # The horizon of a normal map's normal is elsewhere, and so is its cancellation.
-    rel = 1e-2 if name.startswith("normalmap") else 1e-3
+    rel = 1e-2 if name.startswith(("normalmap", "bumpmap")) else 1e-3
     wrong = disagreements(pdf, again, rel=rel, floor=1e-4)
     wrong |= disagreements(weight * pdf[:, None], value, rel=rel, floor=1e-4)
     wrong &= drawn & (np.abs(wo[:, 2]) > 0.01)
@@ -529,7 +546,7 @@ def test_delta_lobes_are_mitsubas(name: str, gallery: Gallery) -> None:
     rows |= {"weight": weight, "their_weight": their_weight}
     assert not wrong.any(), first_rows(wrong, **rows)
 
-    if name.startswith("normalmap"):
+    if name.startswith(("normalmap", "bumpmap")):
         return  # lobes that its normals send to the wrong side end the path: not seen as delta
     reachable = (wi[:, 2] > 0) | (probability < 1)  # a mirror's back: nothing, by either
     excess = (theirs - probability.astype(np.float64))[reachable]

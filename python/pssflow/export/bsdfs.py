@@ -5,9 +5,23 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
+import mitsuba as mi
+
 from .perturbed import switches
 from .textures import export_texture
-from .walk import SWITCH, Converter, Entry, Fields, Walk, number, printed, switch
+from .walk import (
+    SWITCH,
+    Converter,
+    Entry,
+    Fields,
+    RefusedError,
+    Walk,
+    class_of,
+    number,
+    plugin_of,
+    printed,
+    switch,
+)
 
 DISTRIBUTIONS = {"beckmann": "beckmann", "ggx": "ggx"}
 
@@ -120,6 +134,7 @@ def _roughdielectric(walk: Walk, obj: Any, where: str) -> Entry:
 def _normalmap(walk: Walk, obj: Any, where: str) -> Entry:
     fields = Fields(obj)
     nested, texture = fields["nested_bsdf"], fields["normalmap"]
+    _refuse_bumps(nested)
     flip, soften = switches(obj, nested, texture)
     return {
         "nested": export_bsdf(walk, nested, f"{where}.nested_bsdf"),
@@ -127,6 +142,42 @@ def _normalmap(walk: Walk, obj: Any, where: str) -> Entry:
         "flip_invalid_normals": flip,
         "use_shadowing_function": soften,
     }
+
+
+def _bumpmap(walk: Walk, obj: Any, where: str) -> Entry:
+    fields = Fields(obj)
+    nested, texture = fields["nested_bsdf"], fields["nested_texture"]
+    scale = number(fields["scale"], "scale")
+    _refuse_bumps(nested)
+    if class_of(texture) not in HEIGHTS:
+        raise RefusedError(
+            f"has heights from `{plugin_of(texture)}`, which has no slopes; use a bitmap"
+        )
+    flip, soften = switches(obj, nested, texture, scale)
+    return {
+        "nested": export_bsdf(walk, nested, f"{where}.nested_bsdf"),
+        "height": _texture(walk, fields, where, "nested_texture"),
+        "scale": scale,
+        "flip_invalid_normals": flip,
+        "use_shadowing_function": soften,
+    }
+
+
+HEIGHTS = ("BitmapTextureImpl", "UniformSpectrum")
+"""Textures that Mitsuba can take the gradient of."""
+
+
+def _refuse_bumps(bsdf: Any) -> None:
+    """A bump map needs the surface's own frame: not that of another map around it.
+
+    Raises:
+        RefusedError: there is one in `bsdf`, at any depth.
+    """
+    if class_of(bsdf) == "BumpMap":
+        raise RefusedError("nests a `bumpmap` in a frame of its own; give one of the two up")
+    for child in Fields(bsdf).children.values():
+        if isinstance(child, mi.BSDF):
+            _refuse_bumps(child)
 
 
 DISNEY = (
@@ -176,6 +227,7 @@ BSDFS: dict[str, Converter] = {
     "SmoothPlastic": Converter("plastic", "plastic", _coat),
     "MaskBSDF": Converter("mask", "mask", _mask),
     "Null": Converter("null", "null", _null),
+    "BumpMap": Converter("bumpmap", "bumpmap", _bumpmap),
     "NormalMap": Converter("normalmap", "normalmap", _normalmap),
     "Principled": Converter("principled", "principled", _principled),
     "PrincipledThin": Converter("principledthin", "principledthin", _principledthin),

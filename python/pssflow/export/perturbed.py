@@ -1,4 +1,4 @@
-"""`normalmap`: a BSDF in a frame of its own, and the two switches that Mitsuba shows nowhere.
+"""`normalmap` and `bumpmap`: a BSDF in a frame of its own, and the two switches that Mitsuba shows nowhere.
 
 `flip_invalid_normals` and `use_shadowing_function` are neither traversed nor printed. They are found by drawing a few
 samples and comparing them with what each setting would give, computed from the nested BSDF.
@@ -32,14 +32,14 @@ class Samples(NamedTuple):
     weight: F64
 
 
-def switches(bsdf: Any, nested: Any, texture: Any) -> tuple[bool, bool]:
-    """`flip_invalid_normals` and `use_shadowing_function` of a normal map."""
+def switches(bsdf: Any, nested: Any, texture: Any, scale: float | None = None) -> tuple[bool, bool]:
+    """`flip_invalid_normals` and `use_shadowing_function` of a normal map, or of a bump map of this scale."""
     rng = np.random.default_rng(0)
     wi = rng.normal(size=(PROBES, 3))
     wi[:, 2] *= 0.3  # slanted, where normals face away
     wi /= np.linalg.norm(wi, axis=1, keepdims=True)
     uv, u = rng.random((PROBES, 2)), rng.random((PROBES, 3))
-    normals = 2 * _normals(texture, uv) - 1
+    normals = 2 * _normals(texture, uv) - 1 if scale is None else _bumps(texture, uv, scale)
     found = _sample(bsdf, uv, wi, u)
 
     errors: dict[tuple[bool, bool], float] = {}
@@ -87,6 +87,13 @@ def _normals(texture: Any, uv: F64) -> F64:
     return _rows(values)
 
 
+def _bumps(texture: Any, uv: F64, scale: float) -> F64:
+    """Normals (n, 3) of heights over a plane whose parameters are its lengths."""
+    points = _interactions(uv, np.zeros((len(uv), 3)))
+    slope = scale * _rows([texture.eval_1_grad(si) for si in points])
+    return np.column_stack([-slope, np.ones(len(slope))])
+
+
 def _sample(bsdf: Any, uv: F64, wi: F64, u: F64) -> Samples:
     context = mi.BSDFContext()
     drawn = []
@@ -107,16 +114,24 @@ def _interactions(uv: F64, wi: F64) -> Iterator[Any]:
         for (u, v), w in zip(uv, wi, strict=True):
             si = mi.SurfaceInteraction3f()
             si.uv, si.wi = mi.Point2f(u, v), mi.Vector3f(*w)
-            yield si
+            yield _on_a_plane(si)
         return
     si = dr.zeros(mi.SurfaceInteraction3f, len(uv))
     si.uv = mi.Point2f(uv.T.astype(np.float32))
     si.wi = mi.Vector3f(wi.T.astype(np.float32))
-    yield si
+    yield _on_a_plane(si)
+
+
+def _on_a_plane(si: Any) -> Any:
+    """The xy plane: world and local space are one."""
+    x, y, z = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), mi.Vector3f(0, 0, 1)
+    si.n, si.dp_du, si.dp_dv = mi.Normal3f(z), x, y
+    si.sh_frame = mi.Frame3f(x, y, z)
+    return si
 
 
 def _rows(values: list[Any]) -> F64:
-    """(n, 3) of n scalar vectors, or of one wide one."""
+    """(n, …) of n scalar vectors, or of one wide one."""
     if is_scalar():
         return np.array([np.array(v, np.float64) for v in values])
     return np.array(dr.detach(values[0]), np.float64).T

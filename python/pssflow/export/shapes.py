@@ -79,12 +79,17 @@ def _entry(walk: Walk, key: str, shape: Any, emitter: int | None) -> Entry | Non
     return entry
 
 
-def _mesh(walk: Walk, obj: Any, _where: str) -> Entry:
+def _mesh(walk: Walk, obj: Any, where: str) -> Entry:
     positions = rows(obj.vertex_positions_buffer(), 3, np.float32, "vertex_positions")
     faces = rows(obj.faces_buffer(), 3, np.uint32, "faces")
     normals = texcoords = None
     if obj.has_vertex_normals():
         normals = rows(obj.vertex_normals_buffer(), 3, np.float32, "vertex_normals")
+        bad = ~np.isfinite(normals).all(axis=1)
+        if bad.any():
+            # A normal of no length leaves the choice to the triangle's other two, or to its facet.
+            normals = np.where(bad[:, None], np.float32(0), normals)
+            walk.notes.append(f'"{where}": {bad.sum()} vertex normals are not finite and left out')
     if obj.has_vertex_texcoords():
         texcoords = rows(obj.vertex_texcoords_buffer(), 2, np.float32, "vertex_texcoords")
     for name, array in (("vertex_normals", normals), ("vertex_texcoords", texcoords)):

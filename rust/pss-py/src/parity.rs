@@ -1,8 +1,11 @@
 //! Values of single plugins, for tests against one Mitsuba call.
 
+use std::sync::LazyLock;
+
 use numpy::{PyReadonlyArray1, PyReadonlyArray2};
 use pss_render::bsdf::{BsdfSample, Materials, ShadingPoint};
-use pss_render::math::{Rgb, Vec3};
+use pss_render::Interaction;
+use pss_render::math::{Frame, Rgb, Vec3};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
@@ -48,10 +51,23 @@ fn samples(py: Python<'_>, drawn: Vec<Option<BsdfSample>>) -> PyResult<Samples> 
     ))
 }
 
+/// The surface that BSDFs are called on: local and world space are one, and ∂p/∂v leans towards ∂p/∂u.
+static SURFACE: LazyLock<(Interaction, Frame)> = LazyLock::new(|| {
+    let si = Interaction {
+        n: Vec3::Z,
+        shading_normal: Vec3::Z,
+        dp_du: Vec3::new(2.0, 0.0, 0.0),
+        dp_dv: Vec3::new(0.5, 1.5, 0.0),
+        ..Interaction::default()
+    };
+    (si, si.uv_frame())
+});
+
 fn at(materials: &Materials, uv: [f32; 2]) -> ShadingPoint<'_> {
     ShadingPoint {
         uv: uv.into(),
         materials,
+        surface: Some((&SURFACE.0, &SURFACE.1)),
     }
 }
 
@@ -88,6 +104,7 @@ impl Scene {
         dict.set_item("n", column(&|si| si.n)?)?;
         dict.set_item("sh_n", column(&|si| si.shading_normal)?)?;
         dict.set_item("sh_s", column(&|si| si.uv_frame().s)?)?;
+        dict.set_item("dp_dv", column(&|si| si.dp_dv)?)?;
         let uv: Vec<[f32; 2]> = hits
             .iter()
             .map(|h| h.as_ref().map_or([0.0; 2], |si| si.uv.to_array()))

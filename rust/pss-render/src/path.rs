@@ -485,10 +485,14 @@ impl<'a> Tracer<'a> {
     }
 
     #[inline]
-    fn shading_point(&self, state: &State) -> ShadingPoint<'a> {
+    fn shading_point<'s>(&self, state: &'s State) -> ShadingPoint<'s>
+    where
+        'a: 's,
+    {
         ShadingPoint {
             uv: state.si.uv,
             materials: self.scene.materials(),
+            surface: Some((&state.si, &state.frame)),
         }
     }
 }

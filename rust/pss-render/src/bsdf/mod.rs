@@ -8,7 +8,8 @@ use glam::Vec2;
 use serde::Deserialize;
 
 use crate::error::SceneError;
-use crate::math::{Rgb, Vec3};
+use crate::interaction::Interaction;
+use crate::math::{Frame, Rgb, Vec3};
 use crate::texture::{Texture, TextureId};
 
 mod disney;
@@ -70,6 +71,8 @@ pub struct ShadingPoint<'a> {
     pub uv: Vec2,
     /// Textures and nested BSDFs.
     pub materials: &'a Materials,
+    /// The surface and the frame of the local directions, for bump maps; flat where there is none.
+    pub surface: Option<(&'a Interaction, &'a Frame)>,
 }
 
 impl ShadingPoint<'_> {
@@ -287,6 +290,7 @@ macro_rules! registry {
 
 registry! {
     "blendbsdf" => BlendBsdf in blendbsdf;
+    "bumpmap" => BumpMap in bumpmap;
     "conductor" => Conductor in conductor;
     "dielectric" => Dielectric in dielectric;
     "diffuse" => Diffuse in diffuse;

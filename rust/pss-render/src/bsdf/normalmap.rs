@@ -47,7 +47,10 @@ impl NormalMap {
         }
         Perturbed {
             bsdf: at.materials.bsdf(self.nested),
-            at,
+            at: ShadingPoint {
+                surface: None, // another frame; the export refuses bump maps in here
+                ..at
+            },
             frame: Frame::from_tangent(n.normalize_or(Vec3::Z), Vec3::X),
             soften: self.use_shadowing_function,
         }

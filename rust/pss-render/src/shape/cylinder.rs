@@ -73,6 +73,7 @@ impl ShapeModel for Cylinder {
             shading_normal: n,
             uv: Self::uv(local),
             dp_du,
+            dp_dv: self.map.vector(Vec3::Z),
             shape: 0,
         }
     }

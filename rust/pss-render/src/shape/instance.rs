@@ -71,6 +71,7 @@ impl Instance {
         si.n = self.map.normal(si.n);
         si.shading_normal = self.map.normal(si.shading_normal);
         si.dp_du = self.map.vector(si.dp_du);
+        si.dp_dv = self.map.vector(si.dp_dv);
     }
 }
 
