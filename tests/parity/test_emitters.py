@@ -165,7 +165,7 @@ def test_edited_sky_is_seen_as_it_is_now() -> None:
     mi.set_variant(LLVM)
     scene = _scene(_sky("plain"))
     params = mi.traverse(scene)
-    key = next(name for name in params if name.endswith(".data"))
+    key = next(name for name, _ in params.items() if name.endswith(".data"))
     params[key] = mi.TensorXf(np.ascontiguousarray(params[key].numpy()[::-1] * 3.0))
     params[key.replace("data", "scale")] = 0.7
     params.update()
