@@ -207,6 +207,11 @@ def _walk(
     suns = [emitter for _, emitter, _ in emitters if class_of(emitter) == "SunskyEmitter"]
     emitters += [("", sun, None) for sun in suns[: len(walk.entries["sun"])]]
     entries = export_sensor(walk, camera)
+    hides = getattr(scene.integrator(), "hide_emitters", False)
+    if hides and walk.counts["emitter"]["area"]:
+        walk.notes.append(
+            "`hide_emitters` is ignored: the camera sees the surfaces of lights, not what lies behind them"
+        )
     return walk, [shape for _, shape in shapes], [emitter for _, emitter, _ in emitters], entries
 
 
