@@ -50,7 +50,11 @@ def check_references(exported: Export) -> None:
     """Arrays are C-contiguous, of two types, and used once each; indices point at entries."""
     description = exported.description
     used = []
-    for shape in description["shapes"]:
+    instances = [shape for shape in description["shapes"] if shape["type"] == "instance"]
+    assert all(0 <= shape["group"] < len(description["groups"]) for shape in instances)
+    shapes = [shape for shape in description["shapes"] if shape["type"] != "instance"]
+    shapes += [shape for group in description["groups"] for shape in group["shapes"]]
+    for shape in shapes:
         assert 0 <= shape["bsdf"] < len(description["bsdfs"])
         assert shape["emitter"] is None or shape["emitter"] < len(description["emitters"])
         if shape["type"] == "mesh":
@@ -59,7 +63,11 @@ def check_references(exported: Export) -> None:
             assert (faces.dtype, faces.shape[1]) == (np.uint32, 3)
             assert faces.max() < len(positions)
             used += [shape[k] for k in ("positions", "faces", "normals", "texcoords")]
-    used += [entry["data"] for entry in description["textures"] if entry["type"] == "bitmap"]
+    textures = list(description["textures"])
+    for entry in textures:  # grows: boards hold two textures each
+        textures += [entry[name] for name in ("color0", "color1") if name in entry]
+    used += [entry["data"] for entry in textures if entry["type"] == "bitmap"]
+    used += [entry["data"] for entry in description["emitters"] if entry["type"] == "envmap"]
     assert sorted(i for i in used if i is not None) == list(range(len(exported.arrays)))
     assert all(array.flags.c_contiguous for array in exported.arrays)
     for i, emitter in enumerate(description["emitters"]):

@@ -6,6 +6,8 @@
 | `furnace_sphere` | 32 × 32, box                | cube, sphere, disk, cylinder | diffuse          | area (sphere)  |
 | `glossy_room`    | 48 × 32 of 64 × 48, Gauss   | rectangle, cube, sphere      | every glossy one | point, area    |
 | `open_sky`       | 48 × 48, tent               | rectangle, cube, sphere      | diffuse          | constant, area |
+| `sun_and_sky`    | 32 × 32, tent, lens         | rectangle, cube, sphere      | diffuse, plastic | the other kinds |
+| `glass_room`     | 32 × 32, box                | rectangle, sphere, cube      | every delta one  | constant, area |
 
 Set a Mitsuba variant before calling a factory: transforms and bitmaps belong to one. Film sizes are multiples of 16,
 the side of a tile in the statistical tests.
@@ -232,11 +234,161 @@ def open_sky() -> Description:
     }
 
 
+def sun_and_sky() -> Description:
+    """A court under an image of the sky with a low bright spot, a sun and two lamps that have no size.
+
+    Seen by a camera with a lens; on the ground lie the squares of a checkerboard.
+    """
+    T = mi.ScalarTransform4f
+    row, column = np.mgrid[0:24, 0:48]
+    glow = 12 * np.exp(-((row - 9) ** 2 + (column - 30) ** 2) / 6)
+    sky = np.stack([0.3 + glow, 0.4 + 0.8 * glow, 0.7 + 0.5 * glow], -1) * (row < 14)[..., None]
+    camera = _camera(
+        origin=(3.2, -4.2, 2.9), target=(0, 0, 0.4), fov=42, film=_film(32, 32, "tent")
+    )
+    return {
+        "type": "scene",
+        "camera": camera | {"type": "thinlens", "aperture_radius": 0.1, "focus_distance": 5.2},
+        "sky": {
+            "type": "envmap",
+            "bitmap": mi.Bitmap(sky.astype(np.float32)),
+            "scale": 1.3,
+            "to_world": T().rotate([1, 0, 0], 90).rotate([0, 1, 0], 40),
+        },
+        "sun": {
+            "type": "directional",
+            "direction": [0.5, 0.6, -1],
+            "irradiance": _rgb(2.0, 1.8, 1.4),
+            "sampling_weight": 0.7,
+        },
+        "spot": {
+            "type": "spot",
+            "to_world": T().look_at(origin=[-1.5, -2, 2.5], target=[0.3, 0.4, 0], up=[0, 0, 1]),
+            "cutoff_angle": 28,
+            "intensity": _rgb(9.0, 12.0, 9.0),
+        },
+        "slides": {
+            "type": "projector",
+            "to_world": T().look_at(origin=[2, -1.5, 2], target=[-0.6, 0.8, 0.8], up=[0, 0, 1]),
+            "irradiance": _checks(),
+            "fov": 35,
+            "scale": 2.0,
+        },
+        "ground": {
+            "type": "rectangle",
+            "to_world": T().scale(3.0),
+            "bsdf": _twosided(
+                {
+                    "type": "diffuse",
+                    "reflectance": {
+                        "type": "checkerboard",
+                        "color0": _rgb(0.6, 0.5, 0.4),
+                        "color1": _rgb(0.2, 0.3, 0.25),
+                        "to_uv": mi.ScalarTransform3f().scale([3, 4]),
+                    },
+                }
+            ),
+        },
+        "tower": {
+            "type": "cube",
+            "to_world": T()
+            .translate([-0.9, 0.8, 0.8])
+            .rotate([0, 0, 1], 20)
+            .scale([0.5, 0.6, 0.8]),
+            "bsdf": _twosided(
+                {"type": "roughplastic", "alpha": 0.3, "diffuse_reflectance": _rgb(0.6, 0.3, 0.2)}
+            ),
+        },
+        "ball": {
+            "type": "sphere",
+            "center": [0.7, 0.1, 0.5],
+            "radius": 0.5,
+            "bsdf": _twosided(_diffuse(0.4, 0.6, 0.7)),
+        },
+    }
+
+
+def glass_room() -> Description:
+    """Mirrors, panes, smooth and rough glass and masks on a coated floor: NEE alone misses their light.
+
+    The lights are large, so that no single path through the glass holds a good part of the image.
+    """
+    T = mi.ScalarTransform4f
+    glass = {"type": "dielectric", "int_ior": 1.5}
+    return {
+        "type": "scene",
+        "camera": _camera(
+            origin=(2.2, -2.9, 1.6), target=(-0.1, 0.2, 0.5), fov=48, film=_film(32, 32, "box")
+        ),
+        "floor": {
+            "type": "rectangle",
+            "to_world": T().scale(2.0),
+            "bsdf": {"type": "plastic", "diffuse_reflectance": _checks(), "nonlinear": True},
+        },
+        "back": {
+            "type": "rectangle",
+            "to_world": T().translate([0, 2, 1.5]).rotate([1, 0, 0], 90).scale([2, 1.5, 1]),
+            "bsdf": {"type": "conductor", "specular_reflectance": _rgb(0.8, 0.75, 0.7)},
+        },
+        "side": {
+            "type": "rectangle",
+            "to_world": T().translate([-2, 0, 1.5]).rotate([0, 1, 0], 90).scale([1.5, 2, 1]),
+            "bsdf": _twosided({"type": "plastic", "diffuse_reflectance": _rgb(0.3, 0.5, 0.4)}),
+        },
+        "ball": {"type": "sphere", "center": [-0.6, 0.5, 0.55], "radius": 0.5, "bsdf": glass},
+        "frosted": {
+            "type": "sphere",
+            "center": [0.7, 0.9, 0.45],
+            "radius": 0.4,
+            "bsdf": {"type": "roughdielectric", "distribution": "ggx", "alpha": 0.3},
+        },
+        "pane": {
+            "type": "rectangle",
+            "to_world": T().translate([1.1, -0.2, 0.5]).rotate([0, 1, 0], 70).scale([0.5, 0.6, 1]),
+            "bsdf": {"type": "thindielectric", "specular_transmittance": _rgb(0.7, 0.9, 0.8)},
+        },
+        "leaf": {
+            "type": "rectangle",
+            "to_world": T().translate([0, -0.9, 0.6]).rotate([1, 0, 0], 65).scale([0.7, 0.5, 1]),
+            "bsdf": {
+                "type": "mask",
+                "opacity": 0.55,
+                "nested": _twosided(_diffuse(0.7, 0.4, 0.2)),
+            },
+        },
+        "veil": {
+            "type": "rectangle",
+            "to_world": T().translate([-1.2, -0.8, 0.5]).rotate([1, 0, 0], 90).scale(0.5),
+            "bsdf": {
+                "type": "mask",
+                "opacity": 0.7,
+                "nested": _twosided(
+                    {"type": "plastic", "diffuse_reflectance": _rgb(0.6, 0.2, 0.4)}
+                ),
+            },
+        },
+        "ghost": {
+            "type": "cube",
+            "to_world": T().translate([0.1, 1.2, 1.4]).scale(0.3),
+            "bsdf": {"type": "null"},
+        },
+        "lamp": {
+            "type": "rectangle",
+            "to_world": T().translate([0, 0, 3]).rotate([1, 0, 0], 180).scale(1.5),
+            "bsdf": _diffuse(0.0),
+            "light": _area(2.0, 1.9, 1.7),
+        },
+        "sky": {"type": "constant", "radiance": _rgb(0.4, 0.5, 0.6)},
+    }
+
+
 SCENES: dict[str, Callable[[], Description]] = {
     "quad": quad,
     "furnace_sphere": furnace_sphere,
     "glossy_room": glossy_room,
     "open_sky": open_sky,
+    "sun_and_sky": sun_and_sky,
+    "glass_room": glass_room,
 }
 """Every scene of this file by name; a test over all scenes iterates over this."""
 

@@ -93,7 +93,8 @@ class Scene:
         emitter_strategy: str,
         threads: int = 0,
     ) -> dict[str, NDArray[Any]]:
-        """Columns u (n, 2k+1 or 2k+3), pixels (n, 2) film positions in pixels from the crop's corner.
+        """Columns u (n, 2k+1 or 2k+3), pixels (n, 2) film positions in pixels from the crop's corner,
+        or (n, 4) with two numbers in [0, 1) more for the point of a lens; without them its centre.
 
         Returns f (n,3), f_nee (n,3), f_bsdf (n,3), found (n,) bool, position/normal/outgoing (n,k,3),
         pixel (n,2) in [0,1)², emitter (n,) uint32.
@@ -108,7 +109,10 @@ class Scene:
         seed: int = 0,
         threads: int = 0,
     ) -> dict[str, NDArray[Any]]:
-        """All uniform paths of `spp` samples a pixel: u (n,2k+1 or 2k+3), pixels (n,2), g (n,), and trace's keys."""
+        """All uniform paths of `spp` samples a pixel: u (n,2k+1 or 2k+3), pixels (n,2), g (n,), and trace's keys.
+
+        With a lens pixels are (n,4), as `trace` takes them.
+        """
     def render(
         self,
         options: str,
@@ -136,13 +140,25 @@ class Scene:
         """Per ray: valid (n,), p, n, sh_n (n,3), uv (n,2), shape (n,) index, sh_s (n,3) uv-frame tangent."""
     def bsdf_eval_pdf(self, bsdf: int, uv: F32, wi: F32, wo: F32) -> tuple[F32, F32]:
         """Local directions (z = normal): value·cos (n,3) and pdf (n,)."""
-    def bsdf_sample(self, bsdf: int, uv: F32, wi: F32, u: F32) -> tuple[F32, F32, F32]:
-        """Returns wo (n,3), weight (n,3), pdf (n,); pdf 0 where nothing was sampled."""
+    def bsdf_sample(
+        self, bsdf: int, uv: F32, wi: F32, u: F32
+    ) -> tuple[F32, F32, F32, NDArray[np.bool_]]:
+        """Returns wo (n,3), weight (n,3), pdf (n,), delta (n,); pdf 0 where nothing was sampled.
+
+        Where `delta` is set, pdf is the lobe's probability.
+        """
+    def bsdf_sample_delta(
+        self, bsdf: int, uv: F32, wi: F32, u: F32
+    ) -> tuple[F32, tuple[F32, F32, F32, NDArray[np.bool_]]]:
+        """Delta lobes alone, from one number each: their probability (n,), and what `bsdf_sample` returns."""
     def texture_eval(self, texture: int, uv: F32) -> F32: ...
+    def emitter_eval_pdf(self, emitter: int, reference: F32, directions: F32) -> tuple[F32, F32]:
+        """What rays see of an emitter, (n, 3), and its density in solid angle, (n,)."""
+
     def emitter_sample(self, emitter: int, reference: F32, u: F32) -> dict[str, NDArray[Any]]:
         """Returns d (n,3), radiance (n,3), pdf (n,) (0: none), p (n,3)."""
-    def film_ray(self, pixels: F32) -> tuple[F32, F32]:
-        """Origins and directions of camera rays through film positions."""
+    def film_ray(self, pixels: F32, lens: F32 | None = None) -> tuple[F32, F32]:
+        """Origins and directions of camera rays through film positions and points of the lens (None: its centre)."""
     def rays_alone(self, *, spp: int, k: int, threads: int = 0) -> dict[str, float]:
         """Times only the Embree queries that rendering makes: {"seconds", "rays", "rays_per_path"}."""
 

@@ -78,7 +78,7 @@ class Pilot(Trace):
     u: F32
     """Primary numbers (n, 2k+1), or (n, 2k+3) with the strategy `mis`; columns as in `columns`."""
     pixels: F32
-    """Film positions in pixels from the crop's corner, (n, 2)."""
+    """Film positions in pixels from the crop's corner, (n, 2); with a lens (n, 4), its two numbers behind them."""
     g: F32
     """Density that the numbers were drawn from, (n,); 1 throughout."""
     columns: list[str] = field(default_factory=list)
@@ -237,6 +237,7 @@ class Scene:
         |----------|-----------------------------|------------------------------------|
         | `u`      | (n, 2k+1), `mis` (n, 2k+3)  | [0, 1), columns as in `columns`    |
         | `pixels` | (n, 2)                      | x, y in pixels from the crop's corner |
+        |          | or (n, 4), for a `thinlens` | and two numbers in [0, 1) for the lens, else its centre |
 
         Raises:
             ValueError: a shape or value is wrong; the message names the first offender.

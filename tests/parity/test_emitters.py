@@ -13,7 +13,15 @@ import pytest
 from tests.conftest import LLVM
 from tests.support.core import core_scene
 from tests.support.lights import LIGHTS, light
-from tests.support.values import F32, disagreements, first_rows, points, unit_interval, vector3
+from tests.support.values import (
+    F32,
+    disagreements,
+    first_rows,
+    points,
+    sphere_directions,
+    unit_interval,
+    vector3,
+)
 
 pytestmark = pytest.mark.parity
 
@@ -60,13 +68,24 @@ def _sample(scene: mi.Scene, reference: F32, u: F32) -> tuple[dict[str, F32], di
     return ours, theirs
 
 
-def _check(ours: dict[str, F32], theirs: dict[str, F32], *, has_point: bool = True) -> None:
-    """All but 5 in 20,000 lit rows agree: those lie at a light's very edge, or where it is seen edge-on."""
+def _check(
+    ours: dict[str, F32],
+    theirs: dict[str, F32],
+    *,
+    has_point: bool = True,
+    radiance: tuple[float, float] = (1e-4, 1e-3),
+) -> None:
+    """All but 5 in 20,000 lit rows agree: those lie at a light's very edge, or where it is seen edge-on.
+
+    `radiance` is within its first number, relatively, above its second.
+    """
     lit = np.logical_and(ours["lit"], theirs["lit"])
     assert np.count_nonzero(lit) > 1000
     wrong = ours["lit"] != theirs["lit"]
     wrong |= lit & disagreements(ours["d"], theirs["d"], rel=2e-4, floor=1.0)
-    wrong |= lit & disagreements(ours["radiance"], theirs["radiance"], rel=1e-4, floor=1e-3)
+    wrong |= lit & disagreements(
+        ours["radiance"], theirs["radiance"], rel=radiance[0], floor=radiance[1]
+    )
     wrong |= lit & disagreements(ours["pdf"], theirs["pdf"], rel=1e-3, floor=1e-6)
     if has_point:
         scale = float(np.abs(theirs["p"][lit]).max())
@@ -81,6 +100,198 @@ def test_area_light_is_sampled_as_mitsubas(name: str, tmp_path: Path) -> None:
     mi.set_variant(LLVM)
     scene = _scene(light(name, tmp_path))
     _check(*_sample(scene, *_numbers()))
+
+
+def _sky(name: str) -> Description:
+    """Environment maps: a plain one, one that is turned, mirrored and scaled, and others of odd sizes."""
+    rng = np.random.default_rng(33)
+    sizes = {"plain": (16, 32), "turned": (23, 37), "small": (3, 2), "sun": (64, 128)}
+    height, width = sizes.get(name, (9, 20))
+    texels = rng.uniform(0, 2, (height, width, 3)).astype(np.float32)
+    sky: Description = {"type": "envmap", "bitmap": mi.Bitmap(texels)}
+    T = mi.ScalarTransform4f
+    if name == "turned":
+        turn = T().rotate([0.6, 0, 0.8], 70).rotate([0, 1, 0], 200).scale([-1, 1, 1])
+        sky |= {"to_world": turn, "scale": 2.5}
+    elif name == "sun":
+        texels[10:12, 77:79] = [3000, 2500, 2000]
+        texels[40:] = 0
+        sky |= {"bitmap": mi.Bitmap(texels)}
+    elif name == "compensated":
+        sky |= {"mis_compensation": True}
+    return sky
+
+
+SKIES = ("plain", "turned", "small", "sun", "compensated")
+
+
+@pytest.mark.parametrize("name", SKIES)
+def test_sky_is_sampled_as_mitsubas(name: str) -> None:
+    mi.set_variant(LLVM)
+    # A direction's last digits move the place in the image.
+    near = (1e-3, 0.3 if name != "sun" else 300.0)
+    _check(*_sample(_scene(_sky(name)), *_numbers()), has_point=False, radiance=near)
+
+
+@pytest.mark.parametrize("name", SKIES)
+def test_what_a_ray_sees_of_the_sky_is_mitsubas(name: str, variant: str) -> None:
+    """Radiance and density in 10,000 directions (2,000 in the scalar variant): all but 3 within 1e-3."""
+    scene = _scene(_sky(name))
+    core, _ = core_scene(scene)
+    n = 10_000 if variant == LLVM else 2_000
+    d = sphere_directions(np.random.default_rng(34), n)
+    # Below the floor, that nothing hides the sky.
+    reference = np.tile(np.array([[50, 60, -70]], np.float32), (n, 1))
+    radiance, pdf = core.emitter_eval_pdf(0, reference, d)
+    sky = scene.emitters()[0]
+    if variant == LLVM:
+        si, ds = dr.zeros(mi.SurfaceInteraction3f, n), dr.zeros(mi.DirectionSample3f, n)
+        si.wi, ds.d = -vector3(d), vector3(d)
+        seen, density = points(sky.eval(si)), points(sky.pdf_direction(si, ds))
+    else:
+        si, ds = mi.SurfaceInteraction3f(), mi.DirectionSample3f()
+        seen, density = np.empty((n, 3), np.float32), np.empty(n, np.float32)
+        for i, row in enumerate(d.tolist()):
+            si.wi, ds.d = -mi.Vector3f(row), mi.Vector3f(row)
+            seen[i], density[i] = np.array(sky.eval(si)), sky.pdf_direction(si, ds)
+    assert seen.std(axis=0).min() > 0.1
+    wrong = disagreements(radiance, seen, rel=1e-3, floor=0.1)
+    wrong |= disagreements(pdf, density, rel=1e-3, floor=1e-3)
+    rows = {"d": d, "radiance": radiance, "seen": seen, "pdf": pdf, "density": density}
+    assert np.count_nonzero(wrong) <= 3, first_rows(wrong, **rows)
+
+
+def test_edited_sky_is_seen_as_it_is_now() -> None:
+    mi.set_variant(LLVM)
+    scene = _scene(_sky("plain"))
+    params = mi.traverse(scene)
+    key = next(name for name, _ in params.items() if name.endswith(".data"))
+    params[key] = mi.TensorXf(np.ascontiguousarray(params[key].numpy()[::-1] * 3.0))
+    params[key.replace("data", "scale")] = 0.7
+    params.update()
+    _check(*_sample(scene, *_numbers()), has_point=False, radiance=(1e-3, 0.3))
+
+
+def _lamps() -> dict[str, Description]:
+    """Lights from a point or from infinity; each turns on what the others leave at its default."""
+    T = mi.ScalarTransform4f
+    view = T().look_at(origin=[1, -2, 3], target=[0.1, 0, 0.2], up=[0.6, 0, 0.8])
+    texels = np.random.default_rng(35).uniform(0.1, 4, (7, 11, 3)).astype(np.float32)
+    image = {"type": "bitmap", "bitmap": mi.Bitmap(texels), "raw": True}
+    colour = {"type": "rgb", "value": [3, 6, 9]}
+    return {
+        "directional": {"type": "directional", "direction": [1, -2, -3], "irradiance": colour},
+        "directional-turned": {"type": "directional", "to_world": view, "irradiance": colour},
+        "spot": {"type": "spot", "to_world": view, "intensity": colour},
+        "spot-wide": {
+            "type": "spot",
+            "to_world": view,
+            "cutoff_angle": 80,
+            "beam_width": 1,
+            "intensity": colour,
+        },
+        "spot-sharp": {"type": "spot", "to_world": view, "cutoff_angle": 30, "beam_width": 30},
+        "spot-textured": {
+            "type": "spot",
+            "to_world": view,
+            "cutoff_angle": 35,
+            "texture": image,
+            "intensity": colour,
+        },
+        "projector": {"type": "projector", "to_world": view, "irradiance": image, "fov": 40},
+        "projector-scaled": {
+            "type": "projector",
+            "to_world": view @ T().scale([-1, 1, 1]),
+            "irradiance": image | {"filter_type": "nearest"},
+            "fov": 75,
+            "scale": 3.0,
+        },
+    }
+
+
+LAMPS = (
+    *("directional", "directional-turned", "spot", "spot-wide", "spot-sharp", "spot-textured"),
+    *("projector", "projector-scaled"),
+)
+
+
+@pytest.mark.parametrize("name", LAMPS)
+def test_lamp_is_sampled_as_mitsubas(name: str) -> None:
+    mi.set_variant(LLVM)
+    assert set(LAMPS) == set(_lamps())
+    has_point = not name.startswith("directional")
+    ours, theirs = _sample(_scene(_lamps()[name]), *_numbers())
+    # A place in an image, and a share of the light near its rim, hang on a direction's last digits.
+    floor = 0.02 * float(theirs["radiance"].max())
+    _check(ours, theirs, has_point=has_point, radiance=(1e-4, floor))
+
+
+SUNSKIES: dict[str, Description] = {
+    "default": {},
+    "low": {"hour": 18.5, "turbidity": 6.0},
+    "complex": {"complex_sun": True, "sun_direction": [0.2, 0.9, 0.1]},
+    "large": {"sun_aperture": 20.0, "sun_scale": 0.3, "sun_direction": [1.0, 0.2, 0.1]},
+    "no-sun": {"sun_scale": 0.0, "sky_scale": 15.0, "sun_direction": [0.35, 0.87, 0.35]},
+    "no-sky": {"sky_scale": 0.0, "sun_direction": [0.35, 0.87, 0.35]},
+}
+
+
+@pytest.mark.parametrize("name", SUNSKIES)
+def test_baked_sunsky_is_mitsubas(name: str) -> None:
+    """Sky and sun together show Mitsuba's radiance within 1 %, but for the sun's rim; half of the rays near the sun.
+
+    And each has the density that it says: the radiance of its own samples is what a ray sees there, and one over the
+    mean of the inverse density is the solid angle that it covers.
+    """
+    mi.set_variant(LLVM)
+    turn = mi.ScalarTransform4f().rotate([1, 0, 0], -90)
+    scene = _scene({"type": "sunsky", "to_world": turn} | SUNSKIES[name])
+    core, exported = core_scene(scene)
+    emitters = exported.description["emitters"]
+    assert len(exported.emitter_order) == len(emitters) == 1 + (name != "no-sun")
+
+    rng = np.random.default_rng(36)
+    direction = np.array(mi.traverse(scene)["lamp.sun_direction"]).ravel()
+    near = rng.normal(size=(5000, 3)) * rng.choice([0.002, 0.01, 0.1], (5000, 1)) + direction
+    near /= np.linalg.norm(near, axis=1, keepdims=True)
+    d = np.concatenate([near, sphere_directions(rng, 5000)]).astype(np.float32)
+    reference = np.tile(np.array([[50, 60, -70]], np.float32), (len(d), 1))
+    seen = [core.emitter_eval_pdf(i, reference, d) for i in range(len(emitters))]
+    si = dr.zeros(mi.SurfaceInteraction3f, len(d))
+    si.wi = -vector3(d)
+    theirs = points(scene.emitters()[0].eval(si))
+    ours = np.sum([radiance for radiance, _ in seen], axis=0)
+    # Rings of a sun that is darker towards its rim, and towards the horizon.
+    rel = 2e-2 if name == "complex" else 1e-2
+    wrong = disagreements(ours, theirs, rel=rel, floor=1e-3)
+    for sun in emitters[1:]:
+        angle = 2 * np.arcsin(np.linalg.norm(d - sun["direction"], axis=1) / 2)
+        wrong &= np.abs(angle / sun["half_angle"] - 1) > 0.1
+    # At the horizon itself.
+    wrong &= np.abs(d[:, 1]) > 1e-4
+    assert np.count_nonzero(wrong) == 0, first_rows(wrong, d=d, ours=ours, theirs=theirs)
+
+    u = unit_interval(rng, len(d), 2)
+    for i in range(len(emitters)):
+        if not any(np.ravel(seen[i][0])):
+            continue
+        drawn = core.emitter_sample(i, reference, u)
+        radiance, pdf = core.emitter_eval_pdf(i, reference, drawn["d"])
+        lit = drawn["pdf"] > 0
+        assert np.count_nonzero(lit) > 9900
+        bad = lit & disagreements(pdf, drawn["pdf"], rel=1e-2, floor=1e-3)
+        bad |= lit & disagreements(radiance, drawn["radiance"], rel=1e-2, floor=1e-2)
+        assert np.count_nonzero(bad) <= 50, first_rows(bad, d=drawn["d"], pdf=pdf, u=u)
+
+
+def test_laser_gives_no_light_to_a_path() -> None:
+    """A `directionalarea` is drawn as any other light, and its every sample is empty: in both."""
+    mi.set_variant(LLVM)
+    laser = {"type": "rectangle", "light": {"type": "directionalarea"}}
+    scene = mi.load_dict({"type": "scene", "camera": {"type": "perspective"}, "laser": laser})
+    ours, theirs = _sample(scene, *_numbers())
+    assert not ours["lit"].any()
+    assert not theirs["lit"].any()
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from pssflow.export.shapes import ordered_shapes
+from pssflow.export.walk import Fields
 from tests.conftest import LLVM, ROOT
 from tests.scenes import SCENES
 from tests.support.core import core_scene
@@ -95,12 +97,34 @@ def _shapes() -> dict[str, Any]:
     return {"type": "scene", "camera": camera} | shapes
 
 
+def _instanced() -> dict[str, Any]:
+    """Two groups, of several kinds of shapes and of one, each seen three times: turned, stretched and mirrored."""
+    T = mi.ScalarTransform4f
+    every = _shapes()
+    names = ("cube", "mesh", "disk", "sphere", "cylinder-flipped", "mesh-facets")
+    groups = {
+        "many": {"type": "shapegroup"} | {name: every[name] for name in names},
+        "one": {"type": "shapegroup", "lid": {"type": "rectangle"}},
+    }
+    scene = {"type": "scene", "camera": every["camera"], **groups, "ball": {"type": "sphere"}}
+    for group, z in (("many", 0.0), ("one", 2.5)):
+        for i, scale in enumerate(([1, 1, 1], [0.7, 1.2, 0.9], [-0.8, 0.8, 1.1])):
+            turn = T().rotate([0.6, 0, 0.8], 40.0 * i)
+            scene[f"{group}-{i}"] = {
+                "type": "instance",
+                "to_world": T().translate([5.0 * i - 5, 2.0 * i - 2, z]) @ turn.scale(scale),
+                "group": {"type": "ref", "id": group},
+            }
+    return scene
+
+
 def _file(folder: Path) -> Callable[[], mi.Scene]:
     return lambda: mi.load_file(str(folder / "scene.xml"))
 
 
 OURS: dict[str, Callable[[], mi.Scene]] = {
     "every-shape": lambda: mi.load_dict(_shapes()),
+    "instances": lambda: mi.load_dict(_instanced()),
     "cornell-box": _file(ROOT / "scenes" / "cornell-box"),
     "teapot": _file(ROOT / "scenes" / "teapot"),
 } | {name: lambda make=make: mi.load_dict(make()) for name, make in SCENES.items()}
@@ -138,10 +162,17 @@ def _check(scene: mi.Scene) -> None:
 
     si = scene.ray_intersect(mi.Ray3f(mi.Point3f(vector3(origins)), vector3(directions)))
     valid = points(si.is_valid()).astype(bool)
-    shapes = scene.shapes()
+    shapes = [scene.shapes()[place] for place in exported.shape_order]
+    entries = list(exported.description["shapes"])
+    # The shapes of groups come behind the others, and are met where an instance shows them.
+    groups = {child.id(): child for child in Fields(scene).children.values()}
+    for group in exported.description["groups"]:
+        members = ordered_shapes(list(Fields(groups[group["id"]]).children.values()))
+        shapes += [member for _, member in members]
+        entries += group["shapes"]
     shape = np.full(RAYS, np.iinfo(np.uint32).max, np.uint32)
-    for index, place in enumerate(exported.shape_order):
-        shape[points(si.shape == mi.ShapePtr(shapes[place])).astype(bool) & valid] = index
+    for index, one in enumerate(shapes):
+        shape[points(si.shape == mi.ShapePtr(one)).astype(bool) & valid] = index
     assert np.count_nonzero(valid) > RAYS / 20
     assert set(shape[valid]) <= set(range(len(shapes)))
 
@@ -166,7 +197,7 @@ def _check(scene: mi.Scene) -> None:
             a = b + (a - b) - np.round(a - b)
         wrong = same & disagreements(a, b, rel=tolerance, floor=1.0)
         if np.count_nonzero(wrong) > 20:
-            where = {str(exported.description["shapes"][i]["id"]) for i in set(shape[wrong])}
+            where = {str(entries[i]["id"]) for i in set(shape[wrong])}
             text = first_rows(wrong, ours=a, theirs=b, origin=origins, direction=directions)
             failures.append(f"{name} on {sorted(where)}: {text}")
     assert not failures, "\n".join(failures)

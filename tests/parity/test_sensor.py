@@ -10,7 +10,7 @@ import pytest
 
 from tests.conftest import LLVM
 from tests.support.core import core_scene
-from tests.support.values import F32, points
+from tests.support.values import F32, point2, points, unit_interval
 
 pytestmark = pytest.mark.parity
 
@@ -26,7 +26,7 @@ def _film(width: int, height: int, crop: tuple[int, int, int, int] | None = None
 
 
 def _sensors() -> dict[str, Description]:
-    """Perspective cameras; each turns on what the others leave at its default."""
+    """Cameras, perspective unless they say otherwise; each turns on what the others leave at its default."""
     T = mi.ScalarTransform4f
     view = T().look_at(origin=[3, -4, 2], target=[0.2, 0, 0.5], up=[0, 0.1, 1])
     cases: dict[str, Description] = {
@@ -48,6 +48,19 @@ def _sensors() -> dict[str, Description]:
         "mirrored": {"film": _film(96, 64), "to_world": view @ T().scale([-1, 1, 1])},
         "clips": {"film": _film(64, 64), "near_clip": 0.7, "far_clip": 3.1, "to_world": view},
     }
+    thin: Description = {"type": "thinlens", "aperture_radius": 0.2, "focus_distance": 2.5}
+    cases |= {
+        "thinlens": thin | {"film": _film(64, 64), "to_world": view},
+        "thinlens-crop": thin | {"film": _film(96, 64, (17, 5, 30, 41)), "fov": 70, "far_clip": 9},
+        "orthographic": {"type": "orthographic", "film": _film(96, 40), "to_world": view},
+        "orthographic-scaled": {
+            "type": "orthographic",
+            "film": _film(64, 96, (10, 50, 50, 20)),
+            "to_world": view @ T().scale([3, 2, 1]),
+            "near_clip": 0.5,
+            "far_clip": 20,
+        },
+    }
     for axis in ("x", "y", "diagonal", "smaller", "larger"):
         cases[f"fov-{axis}"] = {"film": _film(80, 50, (9, 3, 60, 40)), "fov": 33, "fov_axis": axis}
     return cases
@@ -64,6 +77,7 @@ SENSORS = [
         "mirrored",
         "clips",
     ),
+    *("thinlens", "thinlens-crop", "orthographic", "orthographic-scaled"),
     *("fov-x", "fov-y", "fov-diagonal", "fov-smaller", "fov-larger"),
 ]
 
@@ -97,11 +111,14 @@ def test_rays_are_mitsubas(name: str) -> None:
     assert (core.width, core.height) == (width, height)
 
     pixels = _film_positions(width, height)
-    origins, directions = core.film_ray(pixels)
+    lens = unit_interval(np.random.default_rng(42), len(pixels), 2)
+    origins, directions = core.film_ray(pixels, lens)
     position = mi.Point2f((pixels / np.array([width, height], np.float32)).T.copy())
-    ray, _ = sensor.sample_ray(mi.Float(0), mi.Float(0.5), position, mi.Point2f(0.5, 0.5))
+    ray, _ = sensor.sample_ray(mi.Float(0), mi.Float(0.5), position, point2(lens))
     np.testing.assert_allclose(origins, points(ray.o), atol=1e-5)
-    np.testing.assert_allclose(directions, points(ray.d), atol=2e-6)
+    # What is the same for all rays comes once.
+    d = np.broadcast_to(points(ray.d), directions.shape)
+    np.testing.assert_allclose(directions, d, atol=2e-6)
 
 
 def test_a_list_of_cameras_names_them_all() -> None:

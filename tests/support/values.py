@@ -34,6 +34,10 @@ def interaction(uv: F32, wi: F32 | None = None) -> mi.SurfaceInteraction3f:
     si.uv = point2(uv)
     if wi is not None:
         si.wi = vector3(wi)
+    # The surface that the core's own calls assume, for bump maps.
+    axes = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), mi.Vector3f(0, 0, 1)
+    si.n, si.sh_frame = mi.Normal3f(0, 0, 1), mi.Frame3f(*axes)
+    si.dp_du, si.dp_dv = mi.Vector3f(2, 0, 0), mi.Vector3f(0.5, 1.5, 0)
     return si
 
 

@@ -11,55 +11,55 @@ from tests.exports import Description, load
 
 def test_all_unsupported_things_are_collected_and_the_first_named(variant: str) -> None:
     scene = load(
-        window={"type": "rectangle", "b": {"type": "dielectric"}},
-        bowl={"type": "sphere", "b": {"type": "dielectric", "int_ior": 1.3}},
-        floor={"type": "disk", "b": {"type": "diffuse", "reflectance": {"type": "checkerboard"}}},
-        sun={"type": "directional", "direction": [0, 0, -1]},
-        ground={"type": "cube", "b": {"type": "twosided", "b": {"type": "conductor"}}},
+        window={"type": "rectangle", "b": {"type": "polarizer"}},
+        bowl={"type": "sphere", "b": {"type": "polarizer", "theta": 30.0}},
+        bulb={"type": "point", "intensity": {"type": "blackbody", "temperature": 3000.0}},
+        fog={"type": "sphere", "interior": {"type": "homogeneous"}},
+        ground={"type": "cube", "b": {"type": "twosided", "b": {"type": "pplastic"}}},
     )
     found = {(u.kind, u.plugin, u.shape) for u in inspect_scene(scene).unsupported}
     assert found == {
-        ("BSDF", "dielectric", "window"),
-        ("BSDF", "dielectric", "bowl"),
-        ("texture", "checkerboard", "floor"),
-        ("emitter", "directional", None),
-        ("BSDF", "conductor", "ground"),
+        ("BSDF", "polarizer", "window"),
+        ("BSDF", "polarizer", "bowl"),
+        ("texture", "blackbody", None),
+        ("medium", "homogeneous", "fog"),
+        ("BSDF", "pplastic", "ground"),
     }
     with pytest.raises(UnsupportedError) as caught:
         export(scene)
     message = str(caught.value)
     assert "\n" not in message
-    assert 'shape "bowl": BSDF "dielectric"' in message
+    assert 'shape "bowl": BSDF "polarizer"' in message
     assert "(and 1 more like it)" in message
-    assert 'shape "floor": texture "checkerboard"' in message
+    assert 'shape "fog": medium "homogeneous"' in message
     assert "and 1 more, listed by `pssflow info`" in message
     assert f"BSDFs: {', '.join(SUPPORTED['BSDF'])}" in message
     assert message.endswith("or render this scene with Mitsuba's `path`")
 
 
 REFUSED: dict[str, tuple[Description, str]] = {
-    "instance": (
+    "shape of a group": (
         {
-            "group": {"type": "shapegroup", "s": {"type": "sphere"}},
+            "group": {"type": "shapegroup", "s": {"type": "sphere", "b": {"type": "polarizer"}}},
             "copy": {"type": "instance", "g": {"type": "ref", "id": "group"}},
         },
-        r'shape "copy": plugin "instance" is not supported \(supported shapes: .*sphere',
+        r'^shape "group\.s": BSDF "polarizer" \("group\.s\.bsdf"\) is not supported',
     ),
     "medium": (
         {"fog": {"type": "sphere", "interior": {"type": "homogeneous"}}},
         r'shape "fog": medium "homogeneous" is not supported\. Replace',
     ),
     "sensor": (
-        {"camera": {"type": "thinlens", "aperture_radius": 0.1, "focus_distance": 1.0}},
-        r'sensor "thinlens" \("camera"\) is not supported \(supported sensors: perspective\)',
+        {"camera": {"type": "batch", "left": {"type": "perspective"}}},
+        r'sensor "batch" \("camera"\) is not supported \(supported sensors: orthographic',
     ),
     "spectrum": (
         {"bulb": {"type": "point", "intensity": {"type": "blackbody", "temperature": 3000.0}}},
         r'texture "blackbody" \("bulb.intensity"\) is not supported \(supported textures: bitmap',
     ),
-    "spot": (
-        {"lamp": {"type": "spot"}},
-        r'^emitter "spot" \("lamp"\) is not supported \(supported emitters: area',
+    "scaled light": (
+        {"lamp": {"type": "directional", "to_world": "scaled"}},
+        r'^emitter "directional" \("lamp"\) has a `to_world` that scales',
     ),
 }
 
@@ -67,6 +67,8 @@ REFUSED: dict[str, tuple[Description, str]] = {
 @pytest.mark.parametrize("case", REFUSED)
 def test_refusals_name_the_offender(scalar_variant: str, case: str) -> None:
     parts, message = REFUSED[case]
+    if case == "scaled light":  # transforms exist only in a variant
+        parts = {"lamp": parts["lamp"] | {"to_world": mi.ScalarTransform4f().scale(2)}}
     with pytest.raises(UnsupportedError, match=message):
         export(load(**parts))
 

@@ -28,7 +28,7 @@ from .emitters import EMITTERS, ordered_emitters
 from .sensors import FILMS, SENSORS, export_sensor, select_sensor
 from .shapes import SHAPES, export_shape, ordered_shapes
 from .textures import TEXTURES
-from .walk import Entry, Fields, Unsupported, UnsupportedError, Walk
+from .walk import Entry, Fields, Unsupported, UnsupportedError, Walk, class_of
 
 __all__ = [
     "SCHEMA",
@@ -96,7 +96,7 @@ class Inspection:
     counts: dict[str, dict[str, int]]
     """How often each supported plugin was met, by kind; shared BSDFs and textures count once."""
     triangles: int
-    """Of all supported meshes, two for each rectangle."""
+    """Of all supported meshes, two for each rectangle; those of groups once, however many instances show them."""
     array_bytes: int
     """Size of all arrays."""
     unsupported: list[Unsupported]
@@ -127,6 +127,7 @@ def export(scene: Any, sensor: Any = 0) -> Export:
         "textures": walk.entries["texture"],
         "bsdfs": walk.entries["BSDF"],
         "shapes": walk.entries["shape"],
+        "groups": walk.entries["group"],
         "emitters": walk.entries["emitter"],
         "sensor": camera,
         "film": film,
@@ -149,7 +150,10 @@ def inspect_scene(scene: Any, sensor: Any = 0) -> Inspection:
         ValueError, TypeError: as in `export`.
     """
     walk, *_ = _walk(scene, sensor)
-    meshes = [shape for shape in walk.entries["shape"] if shape["type"] == "mesh"]
+    shapes = walk.entries["shape"] + [
+        shape for group in walk.entries["group"] for shape in group["shapes"]
+    ]
+    meshes = [shape for shape in shapes if shape["type"] == "mesh"]
     triangles = sum(len(walk.arrays[mesh["faces"]]) for mesh in meshes)
     return Inspection(
         counts={kind: dict(sorted(walk.counts[kind].items())) for kind in SUPPORTED},
@@ -182,6 +186,9 @@ def _walk(
     # Mitsuba calls children without an id `object_<address>`: no name for a second process.
     children = Fields(scene).children.items()
     walk = Walk({child: name for name, child in children if not name.startswith("object_")})
+    walk.groups = {
+        child.id(): child for _, child in children if class_of(child) == "ShapeGroupPlugin"
+    }
 
     shapes = ordered_shapes(scene.shapes())
     emitters = ordered_emitters(scene.emitters(), shapes)
@@ -195,7 +202,16 @@ def _walk(
         if entry is not None:
             walk.entries["emitter"].append(entry)
     walk.shape = None
+    # Emitters that came out of another one: behind all others, whose indices stay.
+    walk.entries["emitter"] += walk.entries["sun"]
+    suns = [emitter for _, emitter, _ in emitters if class_of(emitter) == "SunskyEmitter"]
+    emitters += [("", sun, None) for sun in suns[: len(walk.entries["sun"])]]
     entries = export_sensor(walk, camera)
+    hides = getattr(scene.integrator(), "hide_emitters", False)
+    if hides and walk.counts["emitter"]["area"]:
+        walk.notes.append(
+            "`hide_emitters` is ignored: the camera sees the surfaces of lights, not what lies behind them"
+        )
     return walk, [shape for _, shape in shapes], [emitter for _, emitter, _ in emitters], entries
 
 

@@ -64,6 +64,21 @@ def _perspective(_walk: Walk, obj: Any, _where: str) -> Entry:
     }
 
 
+def _orthographic(_walk: Walk, obj: Any, _where: str) -> Entry:
+    return {
+        "to_world": matrix(Fields(obj)["to_world"], "to_world"),
+        "near_clip": number(obj.near_clip(), "near_clip"),
+        "far_clip": number(obj.far_clip(), "far_clip"),
+    }
+
+
+def _thinlens(_walk: Walk, obj: Any, _where: str) -> Entry:
+    fields = Fields(obj)
+    names = ("x_fov", "near_clip", "far_clip", "aperture_radius", "focus_distance")
+    numbers = {name: number(fields[name], name) for name in names}
+    return {"to_world": matrix(fields["to_world"], "to_world"), **numbers}
+
+
 def _hdrfilm(walk: Walk, obj: Any, where: str) -> Entry:
     if obj.sample_border():
         walk.notes.append(
@@ -78,7 +93,9 @@ def _hdrfilm(walk: Walk, obj: Any, where: str) -> Entry:
 
 
 SENSORS: dict[str, Converter] = {
+    "OrthographicCamera": Converter("orthographic", "orthographic", _orthographic),
     "PerspectiveCamera": Converter("perspective", "perspective", _perspective),
+    "ThinLensCamera": Converter("thinlens", "thinlens", _thinlens),
 }
 
 FILMS: dict[str, Converter] = {

@@ -6,6 +6,7 @@ To add one: write a converter, and give it a row in `SHAPES`.
 from __future__ import annotations
 
 import hashlib
+import re
 from collections import Counter
 from typing import Any
 
@@ -59,23 +60,36 @@ def ordered_shapes(shapes: list[Any]) -> list[tuple[str, Any]]:
 
 def export_shape(walk: Walk, key: str, shape: Any, emitter: int | None) -> None:
     """Appends a shape's entry; a refused one leaves a line in `walk.unsupported` instead."""
-    walk.shape = key
-    entry = walk.convert(SHAPES, "shape", shape, key)
+    entry = _entry(walk, key, shape, emitter)
     if entry is not None:
+        walk.entries["shape"].append(entry)
+
+
+def _entry(walk: Walk, key: str, shape: Any, emitter: int | None) -> Entry | None:
+    outer, walk.shape = walk.shape, key
+    entry = walk.convert(SHAPES, "shape", shape, key)
+    # An instance's shapes have BSDFs of their own.
+    if entry is not None and entry["type"] != "instance":
         for medium in (shape.interior_medium(), shape.exterior_medium()):
             if medium is not None:
                 walk.refuse("medium", plugin_of(medium), key)
-        bsdf = export_bsdf(walk, shape.bsdf(), f"{key}.bsdf")
-        walk.entries["shape"].append({**entry, "bsdf": bsdf, "emitter": emitter})
-    walk.shape = None
+        entry["bsdf"] = export_bsdf(walk, shape.bsdf(), f"{key}.bsdf")
+        entry["emitter"] = emitter
+    walk.shape = outer
+    return entry
 
 
-def _mesh(walk: Walk, obj: Any, _where: str) -> Entry:
+def _mesh(walk: Walk, obj: Any, where: str) -> Entry:
     positions = rows(obj.vertex_positions_buffer(), 3, np.float32, "vertex_positions")
     faces = rows(obj.faces_buffer(), 3, np.uint32, "faces")
     normals = texcoords = None
     if obj.has_vertex_normals():
         normals = rows(obj.vertex_normals_buffer(), 3, np.float32, "vertex_normals")
+        bad = ~np.isfinite(normals).all(axis=1)
+        if bad.any():
+            # A normal of no length leaves the choice to the triangle's other two, or to its facet.
+            normals = np.where(bad[:, None], np.float32(0), normals)
+            walk.notes.append(f'"{where}": {bad.sum()} vertex normals are not finite and left out')
     if obj.has_vertex_texcoords():
         texcoords = rows(obj.vertex_texcoords_buffer(), 2, np.float32, "vertex_texcoords")
     for name, array in (("vertex_normals", normals), ("vertex_texcoords", texcoords)):
@@ -92,7 +106,12 @@ def _mesh(walk: Walk, obj: Any, _where: str) -> Entry:
 
 def _placed(_walk: Walk, obj: Any, _where: str) -> Entry:
     """Shapes that their transform says all about: rectangle, disk (whose transform holds its flip), cylinder."""
-    transform = Fields(obj)["to_world"]
+    to_world = checked_matrix(Fields(obj)["to_world"])
+    return {"to_world": to_world, "flip_normals": bool(obj.has_flipped_normals())}
+
+
+def checked_matrix(transform: Any) -> list[float]:
+    """A `to_world` whose inverse Mitsuba knows too; raises `RefusedError` for any other."""
     to_world = matrix(transform, "to_world")
     inverse_transpose = floats(transform.inverse_transpose, 16, "to_world")
     linear = np.reshape(to_world, (4, 4))[:3, :3]
@@ -105,7 +124,7 @@ def _placed(_walk: Walk, obj: Any, _where: str) -> Entry:
             "has a `to_world` whose inverse in Mitsuba is wrong, so that its normals are; "
             "rotate about axes of length 1"
         )
-    return {"to_world": to_world, "flip_normals": bool(obj.has_flipped_normals())}
+    return to_world
 
 
 def _sphere(walk: Walk, obj: Any, where: str) -> Entry:
@@ -117,6 +136,36 @@ def _sphere(walk: Walk, obj: Any, where: str) -> Entry:
         "radius": float(np.float32(np.linalg.norm(to_world[:3, 0]))),
         **placed,
     }
+
+
+def _instance(walk: Walk, obj: Any, _where: str) -> Entry:
+    """A view of a group, which is exported when its first instance is met."""
+    # Mitsuba shows an instance's group by its name alone.
+    found = re.search(r'name = "(.*)"', printed(obj).get("shapegroup", ""))
+    name = found.group(1) if found else ""
+    if name not in walk.groups:
+        raise RefusedError(
+            "shows a shapegroup that is no child of the scene; give it an id and refer to it"
+        )
+    to_world = checked_matrix(Fields(obj)["to_world"])
+    if name not in walk.group_indices:
+        walk.group_indices[name] = len(walk.entries["group"])
+        count = obj.effective_primitive_count()
+        walk.entries["group"].append(_group(walk, name, walk.groups[name], count))
+    return {"group": walk.group_indices[name], "to_world": to_world}
+
+
+def _group(walk: Walk, name: str, obj: Any, count: int) -> Entry:
+    """A group's entry; `count`: of all its primitives, as an instance tells."""
+    shapes = list(Fields(obj).children.values())
+    found = sum(shape.effective_primitive_count() for shape in shapes)
+    if found != count:
+        raise RefusedError(
+            f'shows the shapegroup "{name}" of {count} primitives, but its children hold {found}; '
+            "give each of its shapes an id of its own"
+        )
+    entries = [_entry(walk, f"{name}.{key}", shape, None) for key, shape in ordered_shapes(shapes)]
+    return {"id": name, "shapes": [entry for entry in entries if entry is not None]}
 
 
 SHAPES: dict[str, Converter] = {
@@ -131,6 +180,7 @@ SHAPES: dict[str, Converter] = {
     "Sphere": Converter("sphere", "sphere", _sphere),
     "Disk": Converter("disk", "disk", _placed),
     "Cylinder": Converter("cylinder", "cylinder", _placed),
+    "Instance": Converter("instance", "instance", _instance),
 }
 
 

@@ -83,7 +83,18 @@ def _bitmap(walk: Walk, obj: Any, _where: str) -> Entry:
     }
 
 
+def _checkerboard(walk: Walk, obj: Any, where: str) -> Entry:
+    fields = Fields(obj)
+    entry: Entry = {"to_uv": matrix(fields["to_uv"], "to_uv")}
+    for name in ("color0", "color1"):
+        # Its own: the board holds its two textures, and shares neither.
+        child = walk.convert(TEXTURES, "texture", fields[name], f"{where}.{name}")
+        entry[name] = child
+    return entry
+
+
 TEXTURES: dict[str, Converter] = {
+    "Checkerboard": Converter("checkerboard", "checkerboard", _checkerboard),
     "SRGBReflectanceSpectrum": Converter("srgb", "constant", _constant),
     "UniformSpectrum": Converter("uniform", "constant", _constant),
     "RawConstantTexture": Converter("rawconstant", "constant", _constant),

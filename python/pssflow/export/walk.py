@@ -80,6 +80,10 @@ class Walk:
         self.notes: list[str] = []
         self.shape: str | None = None
         """Id of the shape being converted, for messages."""
+        self.groups: dict[str, Any] = {}
+        """Shapegroups of the scene by name."""
+        self.group_indices: dict[str, int] = {}
+        """Index of each group that an instance showed so far."""
         self._names = names
         self._indices: dict[tuple[str, Hashable], int] = {}
 

@@ -1,8 +1,11 @@
 //! Values of single plugins, for tests against one Mitsuba call.
 
-use numpy::PyReadonlyArray2;
-use pss_render::bsdf::ShadingPoint;
-use pss_render::math::{Rgb, Vec3};
+use std::sync::LazyLock;
+
+use numpy::{PyReadonlyArray1, PyReadonlyArray2};
+use pss_render::Interaction;
+use pss_render::bsdf::{BsdfSample, Materials, ShadingPoint};
+use pss_render::math::{Frame, Rgb, Vec3};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
@@ -24,6 +27,47 @@ fn index(what: &str, i: usize, count: usize) -> PyResult<usize> {
         Err(errors::value(format!(
             "{what} {i} does not exist (there are {count})"
         )))
+    }
+}
+
+/// (wo, weight, pdf, delta)
+type Samples = (Py<PyAny>, Py<PyAny>, Py<PyAny>, Py<PyAny>);
+
+fn samples(py: Python<'_>, drawn: Vec<Option<BsdfSample>>) -> PyResult<Samples> {
+    let nothing = BsdfSample {
+        wo: Vec3::ZERO,
+        weight: Rgb::ZERO,
+        pdf: 0.0,
+        delta: false,
+    };
+    let drawn: Vec<_> = drawn.into_iter().map(|s| s.unwrap_or(nothing)).collect();
+    let wo: Vec<Vec3> = drawn.iter().map(|s| s.wo).collect();
+    let weight: Vec<Rgb> = drawn.iter().map(|s| s.weight).collect();
+    Ok((
+        arrays::to_rows3(py, &wo)?,
+        arrays::to_rows3(py, &weight)?,
+        arrays::to_vector::<f32>(py, drawn.iter().map(|s| s.pdf).collect()),
+        arrays::to_vector::<bool>(py, drawn.iter().map(|s| s.delta).collect()),
+    ))
+}
+
+/// The surface that BSDFs are called on: local and world space are one, and ∂p/∂v leans towards ∂p/∂u.
+static SURFACE: LazyLock<(Interaction, Frame)> = LazyLock::new(|| {
+    let si = Interaction {
+        n: Vec3::Z,
+        shading_normal: Vec3::Z,
+        dp_du: Vec3::new(2.0, 0.0, 0.0),
+        dp_dv: Vec3::new(0.5, 1.5, 0.0),
+        ..Interaction::default()
+    };
+    (si, si.uv_frame())
+});
+
+fn at(materials: &Materials, uv: [f32; 2]) -> ShadingPoint<'_> {
+    ShadingPoint {
+        uv: uv.into(),
+        materials,
+        surface: Some((&SURFACE.0, &SURFACE.1)),
     }
 }
 
@@ -60,6 +104,7 @@ impl Scene {
         dict.set_item("n", column(&|si| si.n)?)?;
         dict.set_item("sh_n", column(&|si| si.shading_normal)?)?;
         dict.set_item("sh_s", column(&|si| si.uv_frame().s)?)?;
+        dict.set_item("dp_dv", column(&|si| si.dp_dv)?)?;
         let uv: Vec<[f32; 2]> = hits
             .iter()
             .map(|h| h.as_ref().map_or([0.0; 2], |si| si.uv.to_array()))
@@ -89,21 +134,12 @@ impl Scene {
         arrays::same_rows("wi", wi.len(), uv.len())?;
         arrays::same_rows("wo", wo.len(), uv.len())?;
         let (values, pdfs): (Vec<Rgb>, Vec<f32>) = (0..uv.len())
-            .map(|i| {
-                bsdf.eval_pdf(
-                    ShadingPoint {
-                        uv: uv[i].into(),
-                        materials,
-                    },
-                    wi[i],
-                    wo[i],
-                )
-            })
+            .map(|i| bsdf.eval_pdf(at(materials, uv[i]), wi[i], wo[i]))
             .unzip();
         Ok((arrays::to_rows3(py, &values)?, arrays::to_vector(py, pdfs)))
     }
 
-    /// Directions drawn from a BSDF: (wo, weight, pdf), pdf 0 where the path ends.
+    /// Directions drawn from a BSDF: (wo, weight, pdf, delta), pdf 0 where the path ends.
     fn bsdf_sample(
         &self,
         py: Python<'_>,
@@ -111,37 +147,39 @@ impl Scene {
         uv: PyReadonlyArray2<'_, f32>,
         wi: PyReadonlyArray2<'_, f32>,
         u: PyReadonlyArray2<'_, f32>,
-    ) -> PyResult<(Py<PyAny>, Py<PyAny>, Py<PyAny>)> {
+    ) -> PyResult<Samples> {
         let materials = self.inner.materials();
         let bsdf = materials.bsdf(index("bsdf", bsdf, materials.bsdfs())?);
         let (uv, u) = (arrays::rows::<2>(&uv, "uv")?, arrays::rows::<2>(&u, "u")?);
         let wi = vectors(&wi, "wi")?;
         arrays::same_rows("wi", wi.len(), uv.len())?;
         arrays::same_rows("u", u.len(), uv.len())?;
-        let (mut wo, mut weight, mut pdf) = (Vec::new(), Vec::new(), Vec::new());
-        for i in 0..uv.len() {
-            let at = ShadingPoint {
-                uv: uv[i].into(),
-                materials,
-            };
-            match bsdf.sample(at, wi[i], u[i]) {
-                Some(s) => {
-                    wo.push(s.wo);
-                    weight.push(s.weight);
-                    pdf.push(s.pdf);
-                }
-                None => {
-                    wo.push(Vec3::ZERO);
-                    weight.push(Rgb::ZERO);
-                    pdf.push(0.0);
-                }
-            }
-        }
-        Ok((
-            arrays::to_rows3(py, &wo)?,
-            arrays::to_rows3(py, &weight)?,
-            arrays::to_vector(py, pdf),
-        ))
+        let drawn = (0..uv.len()).map(|i| bsdf.sample(at(materials, uv[i]), wi[i], u[i]));
+        samples(py, drawn.collect())
+    }
+
+    /// A BSDF's delta lobes alone: their probability, and what `sample` gives of those drawn among them.
+    fn bsdf_sample_delta(
+        &self,
+        py: Python<'_>,
+        bsdf: usize,
+        uv: PyReadonlyArray2<'_, f32>,
+        wi: PyReadonlyArray2<'_, f32>,
+        u: PyReadonlyArray1<'_, f32>,
+    ) -> PyResult<(Py<PyAny>, Samples)> {
+        let materials = self.inner.materials();
+        let bsdf = materials.bsdf(index("bsdf", bsdf, materials.bsdfs())?);
+        let (uv, wi) = (arrays::rows::<2>(&uv, "uv")?, vectors(&wi, "wi")?);
+        let u = arrays::vector(&u);
+        arrays::same_rows("wi", wi.len(), uv.len())?;
+        arrays::same_rows("u", u.len(), uv.len())?;
+        let points = || uv.iter().map(|uv| at(materials, *uv)).zip(&wi);
+        let probability = points().map(|(at, wi)| bsdf.delta_probability(at, *wi));
+        let drawn = points()
+            .zip(&u)
+            .map(|((at, wi), u)| bsdf.sample_delta(at, *wi, *u));
+        let probability = arrays::to_vector::<f32>(py, probability.collect());
+        Ok((probability, samples(py, drawn.collect())?))
     }
 
     /// A texture's colours.
@@ -196,15 +234,44 @@ impl Scene {
         Ok(dict)
     }
 
-    /// Camera rays through film positions: (origins, directions).
+    /// What rays see of an emitter, and its density at each: the surface that they meet, where it is one.
+    fn emitter_eval_pdf(
+        &self,
+        py: Python<'_>,
+        emitter: usize,
+        reference: PyReadonlyArray2<'_, f32>,
+        directions: PyReadonlyArray2<'_, f32>,
+    ) -> PyResult<(Py<PyAny>, Py<PyAny>)> {
+        let emitter = index("emitter", emitter, self.inner.emitters().len())?;
+        let reference = arrays::rows::<3>(&reference, "reference")?;
+        let directions = arrays::rows::<3>(&directions, "directions")?;
+        arrays::same_rows("directions", directions.len(), reference.len())?;
+        let (values, pdfs): (Vec<Rgb>, Vec<f32>) = reference
+            .iter()
+            .zip(&directions)
+            .map(|(p, d)| self.inner.eval_emitter(emitter, *p, *d))
+            .unzip();
+        Ok((arrays::to_rows3(py, &values)?, arrays::to_vector(py, pdfs)))
+    }
+
+    /// Camera rays through film positions and points of the lens, its centre by default: (origins, directions).
+    #[pyo3(signature = (pixels, lens=None))]
     fn film_ray(
         &self,
         py: Python<'_>,
         pixels: PyReadonlyArray2<'_, f32>,
+        lens: Option<PyReadonlyArray2<'_, f32>>,
     ) -> PyResult<(Py<PyAny>, Py<PyAny>)> {
-        let rays: Vec<_> = arrays::rows::<2>(&pixels, "pixels")?
+        let pixels = arrays::rows::<2>(&pixels, "pixels")?;
+        let lens = match lens {
+            Some(lens) => arrays::rows::<2>(&lens, "lens")?,
+            None => vec![[0.5; 2]; pixels.len()],
+        };
+        arrays::same_rows("lens", lens.len(), pixels.len())?;
+        let rays: Vec<_> = pixels
             .into_iter()
-            .map(|p| self.inner.sensor().ray(p))
+            .zip(lens)
+            .map(|(p, lens)| self.inner.sensor().ray(p, lens))
             .collect();
         let origins: Vec<Vec3> = rays.iter().map(|r| Vec3::from_array(r.origin)).collect();
         let directions: Vec<Vec3> = rays.iter().map(|r| Vec3::from_array(r.dir)).collect();

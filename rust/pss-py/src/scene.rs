@@ -191,10 +191,11 @@ impl Scene {
     ) -> PyResult<Bound<'py, PyDict>> {
         let tracer = self.tracer(k, parametrisation, emitter_strategy)?;
         let (u, width) = arrays::matrix(&u);
-        let pixels = arrays::rows::<2>(&pixels, "pixels")?;
+        let (pixels, lens) = film_and_lens(&pixels)?;
         let mut paths = Paths::new(tracer.columns());
         paths.record = true;
         paths.set(&u, width, &pixels).map_err(errors::trace)?;
+        paths.lens = lens;
         drop(u);
         let blocks = py
             .detach(|| pssflow::trace_blocks(&tracer, &paths, threads))
@@ -225,7 +226,14 @@ impl Scene {
             })
             .map_err(errors::render)?;
         let dict = traced(py, &blocks, k)?;
-        dict.set_item("pixels", arrays::to_rows2(py, &paths.film)?)?;
+        let pixels = if paths.lens.is_empty() {
+            arrays::to_rows2(py, &paths.film)?
+        } else {
+            let rows = paths.film.iter().zip(&paths.lens);
+            let flat = rows.flat_map(|([x, y], [u, v])| [*x, *y, *u, *v]).collect();
+            arrays::to_matrix(py, flat, 4)?
+        };
+        dict.set_item("pixels", pixels)?;
         dict.set_item("g", arrays::to_vector(py, vec![1f32; paths.len()]))?;
         dict.set_item("u", arrays::to_matrix(py, paths.u, width)?)?;
         Ok(dict)
@@ -435,6 +443,17 @@ fn record(outcome: &Outcome, options: &Options) -> Value {
         record.extend(summary);
     }
     record
+}
+
+/// Film positions, and the lens' numbers where each row has four.
+#[allow(clippy::type_complexity)]
+fn film_and_lens(pixels: &PyReadonlyArray2<'_, f32>) -> PyResult<(Vec<[f32; 2]>, Vec<[f32; 2]>)> {
+    if numpy::PyUntypedArrayMethods::shape(&**pixels)[1] != 4 {
+        return Ok((arrays::rows::<2>(pixels, "pixels")?, Vec::new()));
+    }
+    let rows = arrays::rows::<4>(pixels, "pixels")?;
+    let split = rows.into_iter().map(|[x, y, u, v]| ([x, y], [u, v]));
+    Ok(split.unzip())
 }
 
 /// Blocks of traced paths as one dictionary of arrays.

@@ -27,9 +27,21 @@ pub(crate) struct SceneDescription {
     pub(crate) textures: Vec<texture::Description>,
     pub(crate) bsdfs: Vec<bsdf::Description>,
     pub(crate) shapes: Vec<shape::Description>,
+    /// What instances show.
+    #[serde(default)]
+    pub(crate) groups: Vec<GroupDescription>,
     pub(crate) emitters: Vec<emitter::Description>,
     pub(crate) sensor: sensor::Description,
     pub(crate) film: film::Description,
+}
+
+/// Shapes in a space of their own.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct GroupDescription {
+    #[serde(rename = "id")]
+    _id: String,
+    pub(crate) shapes: Vec<shape::Description>,
 }
 
 /// Hash of everything that decides the image (hex): the guide of one scene is refused by another.

@@ -17,6 +17,8 @@ pub struct Interaction {
     pub uv: Vec2,
     /// ∂p/∂u, for anisotropic BSDFs.
     pub dp_du: Vec3,
+    /// ∂p/∂v, for bump maps.
+    pub dp_dv: Vec3,
     /// Index of the shape.
     pub shape: u32,
 }

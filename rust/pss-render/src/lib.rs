@@ -15,6 +15,7 @@ mod distribution;
 pub mod emitter;
 mod error;
 pub mod film;
+mod hierarchical;
 mod interaction;
 pub mod math;
 pub mod numbers;

@@ -17,7 +17,7 @@
 use embree4::{Hit, Ray};
 use serde::{Deserialize, Serialize};
 
-use crate::bsdf::{BsdfSample, ShadingPoint};
+use crate::bsdf::{BsdfSample, ShadingPoint, reuse};
 use crate::columns::{Columns, Decision, EmitterStrategy};
 use crate::error::TraceError;
 use crate::interaction::Interaction;
@@ -37,9 +37,11 @@ pub enum Parametrisation {
     /// The BSDF's own importance sampling.
     #[default]
     Bsdf,
-    /// A cosine-weighted hemisphere on wi's side.
+    /// A cosine-weighted hemisphere on wi's side, or both sides' where light passes through. Delta lobes are
+    /// drawn by the BSDF.
     Cosine,
-    /// A uniform hemisphere on wi's side.
+    /// A uniform hemisphere on wi's side, or both sides' where light passes through. Delta lobes are drawn by
+    /// the BSDF.
     Uniform,
 }
 
@@ -183,17 +185,19 @@ impl<'a> Tracer<'a> {
 
     fn camera_rays(&self, paths: &mut Paths) {
         let sensor = self.scene.sensor();
-        let film = &paths.film;
+        let (film, lens) = (&paths.film, &paths.lens);
         paths.states.clear();
-        paths.states.extend(film.iter().map(|&position| State {
-            ray: sensor.ray(position),
-            throughput: Rgb::ONE,
-            si: Interaction::default(),
-            frame: Frame::default(),
-            wi: Vec3::ZERO,
-            emitter: 0,
-            emitter_probability: 0.0,
-        }));
+        paths
+            .states
+            .extend(film.iter().enumerate().map(|(i, &position)| State {
+                ray: sensor.ray(position, lens.get(i).copied().unwrap_or([0.5; 2])),
+                throughput: Rgb::ONE,
+                si: Interaction::default(),
+                frame: Frame::default(),
+                wi: Vec3::ZERO,
+                emitter: 0,
+                emitter_probability: 0.0,
+            }));
     }
 
     /// x₁, by coherent packets: neighbours in a block are neighbours on the film.
@@ -283,17 +287,34 @@ impl<'a> Tracer<'a> {
         let at = self.shading_point(state);
         let bsdf = self.bsdf(state);
         let traits = self.bsdf_traits(state);
-        // No hemisphere carries delta or transmitted light.
-        if self.parametrisation == Parametrisation::Bsdf || !traits.smooth || traits.transmits {
+        if self.parametrisation == Parametrisation::Bsdf || !traits.smooth {
             return bsdf.sample(at, state.wi, u);
+        }
+        // No hemisphere carries delta lobes: the first number chooses them as the BSDF itself would.
+        let p_delta = bsdf.delta_probability(at, state.wi);
+        if u[0] < p_delta {
+            return bsdf.sample_delta(at, state.wi, reuse(u[0], 0.0, p_delta));
+        }
+        let mut p_side = 1.0 - p_delta;
+        let mut u = [reuse(u[0], p_delta, p_side), u[1]];
+        let mut side = 1f32.copysign(state.wi.z);
+        if traits.transmits {
+            // The other side is the second half of the first number.
+            let other = u[0] >= 0.5;
+            u[0] = reuse(u[0], if other { 0.5 } else { 0.0 }, 0.5);
+            side = if other { -side } else { side };
+            p_side *= 0.5;
         }
         let (mut wo, pdf) = if self.parametrisation == Parametrisation::Cosine {
             let wo = square_to_cosine_hemisphere(u);
-            (wo, cosine_hemisphere_pdf(wo.z))
+            (wo, p_side * cosine_hemisphere_pdf(wo.z))
         } else {
-            (square_to_uniform_hemisphere(u), UNIFORM_HEMISPHERE_PDF)
+            (
+                square_to_uniform_hemisphere(u),
+                p_side * UNIFORM_HEMISPHERE_PDF,
+            )
         };
-        wo.z = wo.z.copysign(state.wi.z);
+        wo.z *= side;
         if pdf <= 0.0 {
             return None;
         }
@@ -466,10 +487,14 @@ impl<'a> Tracer<'a> {
     }
 
     #[inline]
-    fn shading_point(&self, state: &State) -> ShadingPoint<'a> {
+    fn shading_point<'s>(&self, state: &'s State) -> ShadingPoint<'s>
+    where
+        'a: 's,
+    {
         ShadingPoint {
             uv: state.si.uv,
             materials: self.scene.materials(),
+            surface: Some((&state.si, &state.frame)),
         }
     }
 }

@@ -14,6 +14,8 @@ pub struct Paths {
     columns: Columns,
     /// In: film positions in pixels from the crop's corner.
     pub film: Vec<[f32; 2]>,
+    /// In: numbers of the lens, two a path; empty without a lens, and for its centre.
+    pub lens: Vec<[f32; 2]>,
     /// In: uniform numbers, [`Columns::width`] a path. Out: the numbers that were used.
     pub u: Vec<f32>,
     /// Out: the term of next-event estimation, undivided.
@@ -98,6 +100,7 @@ impl Paths {
         Self {
             columns,
             film: Vec::new(),
+            lens: Vec::new(),
             u: Vec::new(),
             f_nee: Vec::new(),
             f_bsdf: Vec::new(),
@@ -161,6 +164,7 @@ impl Paths {
         self.u.extend_from_slice(u);
         self.film.clear();
         self.film.extend_from_slice(film);
+        self.lens.clear();
         Ok(())
     }
 

@@ -12,7 +12,7 @@ use crate::emitter::{self, Emitter};
 use crate::error::SceneError;
 use crate::film::Film;
 use crate::interaction::Interaction;
-use crate::math::Vec3;
+use crate::math::{Rgb, Vec3};
 use crate::sensor::Sensor;
 use crate::shape::{Common, Shape};
 use crate::texture::Texture;
@@ -41,6 +41,8 @@ pub struct Scene {
     accel: embree4::Scene,
     shapes: Vec<Shape>,
     commons: Vec<Common>,
+    /// Where each group's shapes begin.
+    group_starts: Vec<usize>,
     materials: Materials,
     /// Per BSDF, so that the main loop does not ask twice.
     traits: Vec<BsdfTraits>,
@@ -92,6 +94,23 @@ fn check_attachments(
     })
 }
 
+/// Hands a shape to Embree; a refusal names the shape.
+fn attach(
+    shape: &Shape,
+    common: &Common,
+    builder: &mut embree4::SceneBuilder,
+    groups: &[embree4::Scene],
+) -> Result<(), SceneError> {
+    let attached = shape.model().attach(builder, groups);
+    attached.map(drop).map_err(|e| match e {
+        SceneError::Embree(source) => SceneError::Geometry {
+            owner: format!("shape {:?}", common.id),
+            source,
+        },
+        other => other,
+    })
+}
+
 impl Scene {
     /// Builds a scene from its description (JSON, schema 1) and arrays, and its BVH on `device`.
     ///
@@ -137,19 +156,37 @@ impl Scene {
         }
         let (mut shapes, mut commons) = (Vec::new(), Vec::new());
         let mut builder = embree4::SceneBuilder::new(device)?;
-        for description in d.shapes {
+        let mut add = |description, emitters| {
             let (common, shape) = Shape::build(description, &mut arrays)?;
             let owner = format!("shape {:?}", common.id);
             check_index(common.bsdf, materials.bsdfs.len(), &owner, "bsdf")?;
             if let Some(e) = common.emitter {
-                check_index(e, d.emitters.len(), &owner, "emitter")?;
+                check_index(e, emitters, &owner, "emitter")?;
             }
-            shape
-                .model()
-                .attach(&mut builder)
-                .map_err(|source| SceneError::Geometry { owner, source })?;
+            Ok::<_, SceneError>((common, shape))
+        };
+        for description in d.shapes {
+            let (common, shape) = add(description, d.emitters.len())?;
             shapes.push(shape);
             commons.push(common);
+        }
+        // Groups' shapes come behind the others, whose indices are Embree's.
+        let top_level = shapes.len();
+        let (mut groups, mut group_starts) = (Vec::new(), Vec::new());
+        for group in d.groups {
+            group_starts.push(shapes.len());
+            let mut group_builder = embree4::SceneBuilder::new(device)?;
+            for description in group.shapes {
+                // Mitsuba has no emitters and no instances in groups.
+                let (common, shape) = add(description, 0)?;
+                attach(&shape, &common, &mut group_builder, &[])?;
+                shapes.push(shape);
+                commons.push(common);
+            }
+            groups.push(group_builder.commit()?);
+        }
+        for (shape, common) in shapes.iter().zip(&commons).take(top_level) {
+            attach(shape, common, &mut builder, &groups)?;
         }
 
         for e in &d.emitters {
@@ -176,7 +213,8 @@ impl Scene {
                 e,
                 emitter::Builder {
                     textures: materials.textures.len(),
-                    shapes: shapes.len(),
+                    shapes: top_level,
+                    arrays: &mut arrays,
                 },
             )?);
         }
@@ -190,6 +228,7 @@ impl Scene {
             accel: builder.commit()?,
             shapes,
             commons,
+            group_starts,
             traits,
             materials,
             environments,
@@ -258,8 +297,25 @@ impl Scene {
     /// The surface at a hit.
     #[inline]
     pub fn interaction(&self, ray: &Ray, hit: &Hit) -> Interaction {
-        let mut si = self.shapes[hit.geom as usize].interaction(ray, hit);
-        si.shape = hit.geom;
+        match hit.inst {
+            None => {
+                let mut si = self.shapes[hit.geom as usize].interaction(ray, hit);
+                si.shape = hit.geom;
+                si
+            }
+            Some(instance) => self.instanced(instance, ray, hit),
+        }
+    }
+
+    /// The surface at a hit in an instance's group.
+    fn instanced(&self, instance: u32, ray: &Ray, hit: &Hit) -> Interaction {
+        let Shape::Instance(instance) = &self.shapes[instance as usize] else {
+            return Interaction::default();
+        };
+        let shape = self.group_starts[instance.group()] + hit.geom as usize;
+        let mut si = self.shapes[shape].interaction(&instance.to_group(ray), hit);
+        instance.place(&mut si);
+        si.shape = shape as u32;
         si
     }
 
@@ -281,6 +337,25 @@ impl Scene {
         self.emitters[i]
             .model()
             .sample_direction(self, reference, u)
+    }
+
+    /// What a ray from a point sees of emitter `i`: its radiance, and the density of
+    /// [`Scene::sample_emitter`] in solid angle. Both are zero where the ray meets something else.
+    pub fn eval_emitter(&self, i: usize, origin: [f32; 3], direction: [f32; 3]) -> (Rgb, f32) {
+        let emitter = self.emitters[i].model();
+        let surface = self.intersect(&Ray::new(origin, direction));
+        let meets = match &surface {
+            Some(si) => self.commons[si.shape as usize].emitter == Some(i),
+            None => emitter.is_environment(),
+        };
+        if !meets {
+            return (Rgb::ZERO, 0.0);
+        }
+        let (p, d) = (Vec3::from_array(origin), Vec3::from_array(direction));
+        (
+            emitter.eval(self, d, surface.as_ref()),
+            emitter.pdf_direction(self, p, d, surface.as_ref()),
+        )
     }
 
     /// What the emitter strategy `auto` means for this scene, and why.

@@ -58,6 +58,24 @@ pub(crate) fn square_to_uniform_triangle(u: [f32; 2]) -> [f32; 2] {
     [1.0 - t, t * u[1]]
 }
 
+/// Three uniform numbers from two: a pair to go on with, and one that is taken from the first number's
+/// last digits. For choices that depend on the pair itself.
+///
+/// The first number gives a stratum of 4,096 and what is left inside it; the second number's own digits
+/// below 1/4,096 refine both. Nothing smooth depends on those, so the three are as good as independent.
+#[inline]
+pub(crate) fn three_from_two(u: [f32; 2]) -> ([f32; 2], f32) {
+    const STRATA: f32 = 4096.0;
+    let (a, b) = (u[0] * STRATA, u[1] * STRATA);
+    let fine = b - b.floor();
+    let third = (a - a.floor()) + fine / STRATA;
+    let below_one = 1.0 - f32::EPSILON / 2.0;
+    (
+        [((a.floor() + fine) / STRATA).min(below_one), u[1]],
+        (third - third.floor()).min(below_one),
+    )
+}
+
 /// Density of [`square_to_cosine_hemisphere`].
 #[inline]
 pub(crate) fn cosine_hemisphere_pdf(cos_theta: f32) -> f32 {

@@ -5,7 +5,7 @@
 
 use pss_guide::Guide;
 use pss_render::math::{Rgb, luminance};
-use pss_render::{Accumulator, Film, Paths, Tile, Tracer, Uniform};
+use pss_render::{Accumulator, Paths, Scene, Tile, Tracer, Uniform};
 use pss_rng::{Purpose, Stream, to_unit};
 use rayon::prelude::*;
 
@@ -24,6 +24,8 @@ pub(crate) const BLOCK: usize = 1024;
 const CHUNK: u32 = 16;
 /// Pieces of work between two merges: bounds the memory of unmerged sums.
 const BATCH: usize = 128;
+/// Block of a path's numbers that the lens uses, where the camera has one: far behind those of u.
+const LENS: u32 = u32::MAX;
 
 /// What all passes of a render share.
 pub(crate) struct PassContext<'a> {
@@ -41,13 +43,14 @@ pub(crate) struct PassContext<'a> {
 /// number that decides whether it is recorded.
 pub(crate) fn path_numbers(
     stream: &Stream,
-    film: &Film,
+    scene: &Scene,
     [x, y]: [u32; 2],
     sample: u32,
     width: usize,
     paths: &mut Paths,
 ) -> [f32; 2] {
     // Numbered over the whole film: a crop renders the same samples as the full image.
+    let film = scene.film();
     let [ox, oy] = film.crop_offset();
     let index = (y + oy) * film.size()[0] + x + ox;
     let block = |group: u32| stream.block(index, sample, group).map(to_unit);
@@ -60,6 +63,10 @@ pub(crate) fn path_numbers(
         group += 1;
     }
     paths.u.truncate(end);
+    if scene.sensor().has_lens() {
+        let [x, y, ..] = block(LENS);
+        paths.lens.push([x, y]);
+    }
     [coin, thin]
 }
 
@@ -203,6 +210,7 @@ impl PassContext<'_> {
         while next < total {
             let n = (total - next).min(BLOCK as u64);
             paths.film.clear();
+            paths.lens.clear();
             paths.u.clear();
             coins.clear();
             for i in next..next + n {
@@ -211,7 +219,7 @@ impl PassContext<'_> {
                 let sample = first_sample + sample;
                 coins.push(path_numbers(
                     &stream,
-                    film,
+                    scene,
                     [x, y],
                     sample,
                     columns.width(),

@@ -13,15 +13,15 @@ use crate::pass::{BLOCK, path_numbers};
 /// Uniform paths of `spp` samples a pixel, rows and pixels in order, not yet traced. The numbers are those
 /// that a render with the same seed uses.
 pub fn uniform_paths(tracer: &Tracer<'_>, seed: u64, spp: u32) -> Paths {
-    let film = tracer.scene().film();
-    let [width, height] = film.crop_size();
+    let scene = tracer.scene();
+    let [width, height] = scene.film().crop_size();
     let columns = tracer.columns();
     let stream = Stream::new(seed, Purpose::Path);
     let mut paths = Paths::new(columns);
     for y in 0..height {
         for x in 0..width {
             for sample in 0..spp {
-                path_numbers(&stream, film, [x, y], sample, columns.width(), &mut paths);
+                path_numbers(&stream, scene, [x, y], sample, columns.width(), &mut paths);
             }
         }
     }
@@ -44,11 +44,14 @@ pub fn trace_blocks(
             .film
             .par_chunks(BLOCK)
             .zip(paths.u.par_chunks(BLOCK * width))
-            .map(|(film, u)| {
+            .enumerate()
+            .map(|(i, (film, u))| {
                 let mut block = Paths::new(tracer.columns());
                 block.record = true;
                 block.film.extend_from_slice(film);
                 block.u.extend_from_slice(u);
+                let lens = paths.lens.chunks(BLOCK).nth(i).unwrap_or_default();
+                block.lens.extend_from_slice(lens);
                 tracer.trace(&mut block, &mut Uniform);
                 block
             })
@@ -82,11 +85,14 @@ pub fn rays_alone(tracer: &Tracer<'_>, spp: u32, threads: usize) -> Result<RayTi
             .film
             .par_chunks(BLOCK)
             .zip(paths.u.par_chunks(BLOCK * width))
-            .map(|(film, u)| {
+            .enumerate()
+            .map(|(i, (film, u))| {
                 let mut block = Paths::new(tracer.columns());
                 block.rays = Some(Default::default());
                 block.film.extend_from_slice(film);
                 block.u.extend_from_slice(u);
+                let lens = paths.lens.chunks(BLOCK).nth(i).unwrap_or_default();
+                block.lens.extend_from_slice(lens);
                 tracer.trace(&mut block, &mut Uniform);
                 block.rays.unwrap_or_default()
             })

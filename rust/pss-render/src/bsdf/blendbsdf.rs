@@ -2,7 +2,7 @@
 
 use serde::Deserialize;
 
-use super::{BsdfId, BsdfModel, BsdfSample, Builder, Materials, ShadingPoint};
+use super::{BsdfId, BsdfModel, BsdfSample, Builder, Materials, ShadingPoint, reuse};
 use crate::error::SceneError;
 use crate::math::{Rgb, Vec3};
 use crate::texture::TextureId;
@@ -30,6 +30,16 @@ impl BlendBsdf {
             weight: b.texture(d.weight)?,
             nested: [b.nested(d.first)?, b.nested(d.second)?],
         })
+    }
+
+    /// Probability of each nested BSDF's delta lobes.
+    fn delta_shares(&self, at: ShadingPoint<'_>, wi: Vec3) -> [f32; 2] {
+        let w = at.scalar(self.weight).clamp(0.0, 1.0);
+        let [first, second] = self.nested.map(|b| at.materials.bsdf(b));
+        [
+            (1.0 - w) * first.delta_probability(at, wi),
+            w * second.delta_probability(at, wi),
+        ]
     }
 }
 
@@ -66,6 +76,30 @@ impl BsdfModel for BlendBsdf {
         let (f0, p0) = m.bsdf(self.nested[0]).eval_pdf(at, wi, wo);
         let (f1, p1) = m.bsdf(self.nested[1]).eval_pdf(at, wi, wo);
         (f0 * (1.0 - w) + f1 * w, p0 * (1.0 - w) + p1 * w)
+    }
+
+    fn delta_probability(&self, at: ShadingPoint<'_>, wi: Vec3) -> f32 {
+        let shares = self.delta_shares(at, wi);
+        shares[0] + shares[1]
+    }
+
+    fn sample_delta(&self, at: ShadingPoint<'_>, wi: Vec3, u: f32) -> Option<BsdfSample> {
+        let shares = self.delta_shares(at, wi);
+        let split = shares[0] / (shares[0] + shares[1]);
+        let (chosen, u) = if u < split {
+            (0, reuse(u, 0.0, split))
+        } else {
+            (1, reuse(u, split, 1.0 - split))
+        };
+        let w = at.scalar(self.weight).clamp(0.0, 1.0);
+        let m = at.materials;
+        let mut s = m.bsdf(self.nested[chosen]).sample_delta(at, wi, u)?;
+        s.pdf *= [1.0 - w, w][chosen];
+        Some(s)
+    }
+
+    fn two_sided(&self, m: &Materials) -> bool {
+        self.nested.iter().any(|&b| m.bsdf(b).two_sided(m))
     }
 
     fn transmits(&self, m: &Materials) -> bool {

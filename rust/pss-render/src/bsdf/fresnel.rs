@@ -9,6 +9,8 @@ pub(crate) struct Dielectric {
     pub(crate) reflectance: f32,
     /// Cosine of the transmitted direction, of the sign opposite to the incident one's.
     pub(crate) cos_theta_t: f32,
+    /// Relative index of the transmitted side ÷ the incident one's.
+    pub(crate) eta_it: f32,
     /// Relative index on the way back, η_t⁻¹ in the incident ray's order.
     pub(crate) eta_ti: f32,
 }
@@ -34,6 +36,7 @@ pub(crate) fn dielectric(cos_theta_i: f32, eta: f32) -> Dielectric {
     Dielectric {
         reflectance,
         cos_theta_t: if cos_theta_i >= 0.0 { -cos_t } else { cos_t },
+        eta_it,
         eta_ti,
     }
 }
@@ -41,6 +44,20 @@ pub(crate) fn dielectric(cos_theta_i: f32, eta: f32) -> Dielectric {
 /// Refracts `wi` at the microfacet `m`.
 pub(crate) fn refract(wi: Vec3, m: Vec3, f: Dielectric) -> Vec3 {
     m * (wi.dot(m) * f.eta_ti + f.cos_theta_t) - wi * f.eta_ti
+}
+
+/// Share of diffuse light that a dielectric interface of relative index `eta` reflects: the fits that
+/// Mitsuba uses, by Egan and Hilgeman (1973) from the dense side and by d'Eon and Irving (2011) from the thin.
+pub(crate) fn diffuse_reflectance(eta: f32) -> f32 {
+    let x = 1.0 / eta;
+    if eta < 1.0 {
+        0.0636 * x + eta * (eta * -1.4399 + 0.7099) + 0.6681
+    } else {
+        const D_EON: [f32; 6] = [
+            0.919_317, -3.479_3, 6.753_35, -7.809_89, 4.985_54, -1.368_81,
+        ];
+        D_EON.iter().rev().fold(0.0, |sum, c| sum * x + c)
+    }
 }
 
 /// Unpolarised reflectance of a conductor of complex index η − ik, per channel.

@@ -43,6 +43,17 @@ impl Distribution {
         }
     }
 
+    /// The distribution that [`Distribution::sample`] should draw from where light also passes through: if
+    /// all normals are drawn, a slightly rougher one, so that no weight is large (Walter et al. 2007, §5.3).
+    pub(crate) fn for_sampling(mut self, cos_theta_i: f32) -> Self {
+        if !self.sample_visible {
+            let scale = 1.2 - 0.2 * cos_theta_i.abs().sqrt();
+            self.alpha_u *= scale;
+            self.alpha_v *= scale;
+        }
+        self
+    }
+
     /// D(m).
     pub(crate) fn eval(&self, m: Vec3) -> f32 {
         let alpha_uv = self.alpha_u * self.alpha_v;

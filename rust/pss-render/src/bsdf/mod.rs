@@ -8,11 +8,14 @@ use glam::Vec2;
 use serde::Deserialize;
 
 use crate::error::SceneError;
-use crate::math::{Rgb, Vec3};
+use crate::interaction::Interaction;
+use crate::math::{Frame, Rgb, Vec3};
 use crate::texture::{Texture, TextureId};
 
+mod disney;
 mod fresnel;
 mod microfacet;
+mod perturbed;
 
 /// Index into the scene's BSDFs.
 pub type BsdfId = usize;
@@ -68,6 +71,8 @@ pub struct ShadingPoint<'a> {
     pub uv: Vec2,
     /// Textures and nested BSDFs.
     pub materials: &'a Materials,
+    /// The surface and the frame of the local directions, for bump maps; flat where there is none.
+    pub surface: Option<(&'a Interaction, &'a Frame)>,
 }
 
 impl ShadingPoint<'_> {
@@ -82,6 +87,34 @@ impl ShadingPoint<'_> {
     }
 }
 
+/// A number that chose the part [from, from + width) of [0, 1), stretched over [0, 1) to be used again.
+#[inline]
+pub(crate) fn reuse(u: f32, from: f32, width: f32) -> f32 {
+    ((u - from) / width).clamp(0.0, 1.0 - f32::EPSILON / 2.0)
+}
+
+/// A delta lobe; `None` where its weight or probability is zero.
+#[inline]
+fn delta_lobe(wo: Vec3, weight: Rgb, probability: f32) -> Option<BsdfSample> {
+    (probability > 0.0).then_some(BsdfSample {
+        wo,
+        weight,
+        pdf: probability,
+        delta: true,
+    })
+}
+
+/// Whether a roughness along u and one along v may differ, so that the azimuth matters.
+fn alphas_differ(m: &Materials, alpha_u: TextureId, alpha_v: TextureId) -> bool {
+    match (m.texture(alpha_u), m.texture(alpha_v)) {
+        _ if alpha_u == alpha_v => false,
+        (u @ Texture::Constant(_), v @ Texture::Constant(_)) => {
+            u.eval_scalar(Vec2::ZERO) != v.eval_scalar(Vec2::ZERO)
+        }
+        _ => true,
+    }
+}
+
 /// What each BSDF file provides.
 pub(crate) trait BsdfModel {
     /// Draws `wo`; the lobe is chosen from `u[0]`, which is then rescaled and reused. `None`: the
@@ -91,8 +124,24 @@ pub(crate) trait BsdfModel {
     /// f·|cos θ_o| and the density of [`BsdfModel::sample`] in solid angle, delta lobes left out.
     fn eval_pdf(&self, at: ShadingPoint<'_>, wi: Vec3, wo: Vec3) -> (Rgb, f32);
 
-    /// Whether it carries light to the other side.
+    /// Probability that [`BsdfModel::sample`] takes a delta lobe.
+    fn delta_probability(&self, _at: ShadingPoint<'_>, _wi: Vec3) -> f32 {
+        0.0
+    }
+
+    /// Draws among the delta lobes alone, in proportion to their probabilities, from one number in [0, 1).
+    /// Weight and probability are those of [`BsdfModel::sample`].
+    fn sample_delta(&self, _at: ShadingPoint<'_>, _wi: Vec3, _u: f32) -> Option<BsdfSample> {
+        None
+    }
+
+    /// Whether a smooth lobe carries light to the other side.
     fn transmits(&self, _materials: &Materials) -> bool {
+        false
+    }
+
+    /// Whether anything happens for `wi` below the surface.
+    fn two_sided(&self, _materials: &Materials) -> bool {
         false
     }
 
@@ -196,9 +245,27 @@ macro_rules! registry {
                 match self { $(Self::$variant(b) => b.eval_pdf(at, wi, wo),)* }
             }
 
-            /// Whether it carries light to the other side.
+            /// Probability that [`Bsdf::sample`] takes a delta lobe.
+            #[inline]
+            pub fn delta_probability(&self, at: ShadingPoint<'_>, wi: Vec3) -> f32 {
+                match self { $(Self::$variant(b) => b.delta_probability(at, wi),)* }
+            }
+
+            /// Draws among the delta lobes alone from one number; weight and probability are those of
+            /// [`Bsdf::sample`]. `None` ends the path.
+            #[inline]
+            pub fn sample_delta(&self, at: ShadingPoint<'_>, wi: Vec3, u: f32) -> Option<BsdfSample> {
+                match self { $(Self::$variant(b) => b.sample_delta(at, wi, u),)* }
+            }
+
+            /// Whether a smooth lobe carries light to the other side.
             pub fn transmits(&self, materials: &Materials) -> bool {
                 match self { $(Self::$variant(b) => b.transmits(materials),)* }
+            }
+
+            /// Whether anything happens for `wi` below the surface.
+            pub fn two_sided(&self, materials: &Materials) -> bool {
+                match self { $(Self::$variant(b) => b.two_sided(materials),)* }
             }
 
             /// Whether any lobe is smooth, so that NEE can join it.
@@ -224,8 +291,19 @@ macro_rules! registry {
 
 registry! {
     "blendbsdf" => BlendBsdf in blendbsdf;
+    "bumpmap" => BumpMap in bumpmap;
+    "conductor" => Conductor in conductor;
+    "dielectric" => Dielectric in dielectric;
     "diffuse" => Diffuse in diffuse;
+    "mask" => Mask in mask;
+    "normalmap" => NormalMap in normalmap;
+    "null" => Null in null;
+    "plastic" => Plastic in plastic;
+    "principled" => Principled in principled;
+    "principledthin" => PrincipledThin in principledthin;
     "roughconductor" => RoughConductor in roughconductor;
+    "roughdielectric" => RoughDielectric in roughdielectric;
     "roughplastic" => RoughPlastic in roughplastic;
+    "thindielectric" => ThinDielectric in thindielectric;
     "twosided" => TwoSided in twosided;
 }

@@ -4,10 +4,10 @@
 use serde::Deserialize;
 
 use super::microfacet::{Distribution, Kind};
-use super::{BsdfModel, BsdfSample, Builder, Materials, ShadingPoint, fresnel};
+use super::{BsdfModel, BsdfSample, Builder, Materials, ShadingPoint, alphas_differ, fresnel};
 use crate::error::SceneError;
 use crate::math::{Rgb, Vec3, reflect};
-use crate::texture::{Texture, TextureId};
+use crate::texture::TextureId;
 
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -110,13 +110,6 @@ impl BsdfModel for RoughConductor {
     }
 
     fn anisotropic(&self, m: &Materials) -> bool {
-        match (m.texture(self.alpha_u), m.texture(self.alpha_v)) {
-            _ if self.alpha_u == self.alpha_v => false,
-            (u @ Texture::Constant(_), v @ Texture::Constant(_)) => {
-                let uv = glam::Vec2::ZERO;
-                u.eval_scalar(uv) != v.eval_scalar(uv)
-            }
-            _ => true,
-        }
+        alphas_differ(m, self.alpha_u, self.alpha_v)
     }
 }

@@ -58,6 +58,37 @@ impl BsdfModel for TwoSided {
         }
     }
 
+    #[inline]
+    fn delta_probability(&self, at: ShadingPoint<'_>, wi: Vec3) -> f32 {
+        if wi.z > 0.0 {
+            at.materials.bsdf(self.sides[0]).delta_probability(at, wi)
+        } else {
+            at.materials
+                .bsdf(self.sides[1])
+                .delta_probability(at, wi * FLIP)
+        }
+    }
+
+    #[inline]
+    fn sample_delta(&self, at: ShadingPoint<'_>, wi: Vec3, u: f32) -> Option<BsdfSample> {
+        if wi.z > 0.0 {
+            at.materials.bsdf(self.sides[0]).sample_delta(at, wi, u)
+        } else {
+            let back = at.materials.bsdf(self.sides[1]);
+            let mut s = back.sample_delta(at, wi * FLIP, u)?;
+            s.wo *= FLIP;
+            Some(s)
+        }
+    }
+
+    fn transmits(&self, m: &Materials) -> bool {
+        self.sides.iter().any(|&s| m.bsdf(s).transmits(m))
+    }
+
+    fn two_sided(&self, _: &Materials) -> bool {
+        true
+    }
+
     fn smooth(&self, m: &Materials) -> bool {
         self.sides.iter().any(|&s| m.bsdf(s).smooth(m))
     }

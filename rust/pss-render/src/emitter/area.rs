@@ -28,7 +28,7 @@ pub struct Area {
 }
 
 impl Area {
-    pub(super) fn build(d: Description, b: Builder) -> Result<Self, SceneError> {
+    pub(super) fn build(d: Description, b: Builder<'_>) -> Result<Self, SceneError> {
         let owner = format!("emitter {:?}", d.id);
         check_index(d.shape, b.shapes, &owner, "shape")?;
         check_index(d.radiance, b.textures, &owner, "texture")?;

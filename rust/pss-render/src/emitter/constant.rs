@@ -26,7 +26,7 @@ pub struct Constant {
 }
 
 impl Constant {
-    pub(super) fn build(d: Description, _b: Builder) -> Result<Self, SceneError> {
+    pub(super) fn build(d: Description, _b: Builder<'_>) -> Result<Self, SceneError> {
         check_all_finite(&d.radiance, &format!("emitter {:?}", d.id), "radiance")?;
         Ok(Self {
             radiance: Rgb::from_array(d.radiance),

@@ -3,6 +3,7 @@
 
 use serde::Deserialize;
 
+use crate::arrays::Arrays;
 use crate::error::SceneError;
 use crate::interaction::Interaction;
 use crate::math::{Rgb, Vec3};
@@ -63,9 +64,10 @@ pub(crate) trait EmitterModel {
 }
 
 /// What an emitter's parts refer to, checked while the scene is built.
-pub(crate) struct Builder {
+pub(crate) struct Builder<'a> {
     pub(crate) textures: usize,
     pub(crate) shapes: usize,
+    pub(crate) arrays: &'a mut Arrays,
 }
 
 macro_rules! registry {
@@ -96,7 +98,7 @@ macro_rules! registry {
         }
 
         impl Emitter {
-            pub(crate) fn build(description: Description, builder: Builder) -> Result<Self, SceneError> {
+            pub(crate) fn build(description: Description, builder: Builder<'_>) -> Result<Self, SceneError> {
                 Ok(match description {
                     $(Description::$variant(d) => Self::$variant($module::$variant::build(d, builder)?),)*
                 })
@@ -129,5 +131,11 @@ fn one() -> f32 {
 registry! {
     "area" => Area in area;
     "constant" => Constant in constant;
+    "directional" => Directional in directional;
+    "directionalarea" => DirectionalArea in directionalarea;
+    "envmap" => Envmap in envmap;
     "point" => Point in point;
+    "projector" => Projector in projector;
+    "spot" => Spot in spot;
+    "sun" => Sun in sun;
 }

@@ -27,7 +27,7 @@ pub struct Point {
 }
 
 impl Point {
-    pub(super) fn build(d: Description, _b: Builder) -> Result<Self, SceneError> {
+    pub(super) fn build(d: Description, _b: Builder<'_>) -> Result<Self, SceneError> {
         let owner = format!("emitter {:?}", d.id);
         check_all_finite(&d.position, &owner, "position")?;
         check_all_finite(&d.intensity, &owner, "intensity")?;

@@ -2,7 +2,7 @@
 
 use std::f32::consts::TAU;
 
-use embree4::{EmbreeError, GeomId, Hit, Quadric, Ray, SceneBuilder};
+use embree4::{GeomId, Hit, Quadric, Ray, SceneBuilder};
 use glam::Vec2;
 use serde::Deserialize;
 
@@ -53,8 +53,8 @@ impl Cylinder {
 }
 
 impl ShapeModel for Cylinder {
-    fn attach(&self, builder: &mut SceneBuilder) -> Result<GeomId, EmbreeError> {
-        builder.quadric(Quadric::Cylinder { to_world: self.map.rows() })
+    fn attach(&self, builder: &mut SceneBuilder, _groups: &[embree4::Scene]) -> Result<GeomId, SceneError> {
+        Ok(builder.quadric(Quadric::Cylinder { to_world: self.map.rows() })?)
     }
 
     fn interaction(&self, ray: &Ray, hit: &Hit) -> Interaction {
@@ -73,6 +73,7 @@ impl ShapeModel for Cylinder {
             shading_normal: n,
             uv: Self::uv(local),
             dp_du,
+            dp_dv: self.map.vector(Vec3::Z),
             shape: 0,
         }
     }

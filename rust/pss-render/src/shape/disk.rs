@@ -2,7 +2,7 @@
 
 use std::f32::consts::{PI, TAU};
 
-use embree4::{EmbreeError, GeomId, Hit, Quadric, Ray, SceneBuilder};
+use embree4::{GeomId, Hit, Quadric, Ray, SceneBuilder};
 use glam::Vec2;
 use serde::Deserialize;
 
@@ -53,8 +53,8 @@ impl Disk {
 }
 
 impl ShapeModel for Disk {
-    fn attach(&self, builder: &mut SceneBuilder) -> Result<GeomId, EmbreeError> {
-        builder.quadric(Quadric::Disk { to_world: self.map.rows() })
+    fn attach(&self, builder: &mut SceneBuilder, _groups: &[embree4::Scene]) -> Result<GeomId, SceneError> {
+        Ok(builder.quadric(Quadric::Disk { to_world: self.map.rows() })?)
     }
 
     fn interaction(&self, ray: &Ray, hit: &Hit) -> Interaction {
@@ -71,6 +71,7 @@ impl ShapeModel for Disk {
             shading_normal: self.normal,
             uv: Self::uv(local.x, local.y),
             dp_du: self.map.vector(Vec3::new(cos_phi, sin_phi, 0.0)),
+            dp_dv: self.map.vector(Vec3::new(-sin_phi, cos_phi, 0.0)) * (TAU * r),
             shape: 0,
         }
     }

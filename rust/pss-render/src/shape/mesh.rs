@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use embree4::{EmbreeError, GeomId, Hit, Ray, SceneBuilder};
+use embree4::{GeomId, Hit, Ray, SceneBuilder};
 use glam::Vec2;
 use serde::Deserialize;
 
@@ -144,8 +144,8 @@ fn texcoord(texcoords: &[f32], i: usize) -> Vec2 {
 }
 
 impl ShapeModel for Mesh {
-    fn attach(&self, builder: &mut SceneBuilder) -> Result<GeomId, EmbreeError> {
-        builder.triangles(&*self.positions, &*self.faces)
+    fn attach(&self, builder: &mut SceneBuilder, _groups: &[embree4::Scene]) -> Result<GeomId, SceneError> {
+        Ok(builder.triangles(&*self.positions, &*self.faces)?)
     }
 
     #[inline]
@@ -162,15 +162,19 @@ impl ShapeModel for Mesh {
             }
             None => n,
         };
-        let (uv, dp_du) = match &self.texcoords {
+        let (uv, dp_du, dp_dv) = match &self.texcoords {
             Some(texcoords) => {
                 let [t0, t1, t2] = face.map(|i| texcoord(texcoords, i));
                 let (d1, d2) = (t1 - t0, t2 - t0);
                 let det = d1.perp_dot(d2);
-                let dp_du = if det == 0.0 { Vec3::ZERO } else { (e1 * d2.y - e2 * d1.y) / det };
-                (t0 * b[0] + t1 * b[1] + t2 * b[2], dp_du)
+                let (dp_du, dp_dv) = if det == 0.0 {
+                    (Vec3::ZERO, Vec3::ZERO)
+                } else {
+                    ((e1 * d2.y - e2 * d1.y) / det, (e2 * d1.x - e1 * d2.x) / det)
+                };
+                (t0 * b[0] + t1 * b[1] + t2 * b[2], dp_du, dp_dv)
             }
-            None => (Vec2::new(b[1], b[2]), e1),
+            None => (Vec2::new(b[1], b[2]), e1, e2),
         };
         Interaction {
             p: p0 * b[0] + p1 * b[1] + p2 * b[2],
@@ -178,6 +182,7 @@ impl ShapeModel for Mesh {
             shading_normal,
             uv,
             dp_du,
+            dp_dv,
             shape: 0,
         }
     }

@@ -1,7 +1,7 @@
 //! Shapes: geometry for Embree, shading points, and sampling of their surfaces as Mitsuba does it.
 //! A new one is a file here and a line in the registry below.
 
-use embree4::{EmbreeError, GeomId, Hit, Ray, SceneBuilder};
+use embree4::{GeomId, Hit, Ray, SceneBuilder};
 use glam::Vec2;
 use serde::Deserialize;
 
@@ -11,7 +11,7 @@ use crate::error::SceneError;
 use crate::interaction::Interaction;
 use crate::math::Vec3;
 
-mod affine;
+pub(crate) mod affine;
 
 /// A point drawn on a shape as seen from a reference point.
 #[derive(Clone, Copy, Debug)]
@@ -28,8 +28,12 @@ pub struct SurfaceSample {
 
 /// What each shape file provides.
 pub(crate) trait ShapeModel {
-    /// Hands the geometry to Embree.
-    fn attach(&self, builder: &mut SceneBuilder) -> Result<GeomId, EmbreeError>;
+    /// Hands the geometry to Embree. `groups`: what instances are views of.
+    fn attach(
+        &self,
+        builder: &mut SceneBuilder,
+        groups: &[embree4::Scene],
+    ) -> Result<GeomId, SceneError>;
 
     /// The surface at a hit; `shape` is filled in by the caller.
     fn interaction(&self, ray: &Ray, hit: &Hit) -> Interaction;
@@ -143,6 +147,7 @@ macro_rules! registry {
 registry! {
     "cylinder" => Cylinder in cylinder;
     "disk" => Disk in disk;
+    "instance" => Instance in instance;
     "mesh" => Mesh in mesh;
     "rectangle" => Rectangle in rectangle;
     "sphere" => Sphere in sphere;

@@ -1,7 +1,7 @@
 //! Mitsuba's rectangle: the square [−1, 1]² in the plane z = 0 of its own space. Two triangles for rays,
 //! but sampled as a square.
 
-use embree4::{EmbreeError, GeomId, Hit, Ray, SceneBuilder};
+use embree4::{GeomId, Hit, Ray, SceneBuilder};
 use glam::Vec2;
 use serde::Deserialize;
 
@@ -62,8 +62,8 @@ impl Rectangle {
 }
 
 impl ShapeModel for Rectangle {
-    fn attach(&self, builder: &mut SceneBuilder) -> Result<GeomId, EmbreeError> {
-        self.mesh.attach(builder)
+    fn attach(&self, builder: &mut SceneBuilder, groups: &[embree4::Scene]) -> Result<GeomId, SceneError> {
+        self.mesh.attach(builder, groups)
     }
 
     #[inline]

@@ -2,7 +2,7 @@
 
 use std::f32::consts::{PI, TAU};
 
-use embree4::{EmbreeError, GeomId, Hit, Quadric, Ray, SceneBuilder};
+use embree4::{GeomId, Hit, Quadric, Ray, SceneBuilder};
 use glam::Vec2;
 use serde::Deserialize;
 
@@ -91,11 +91,11 @@ impl Sphere {
 }
 
 impl ShapeModel for Sphere {
-    fn attach(&self, builder: &mut SceneBuilder) -> Result<GeomId, EmbreeError> {
-        builder.quadric(Quadric::Sphere {
+    fn attach(&self, builder: &mut SceneBuilder, _groups: &[embree4::Scene]) -> Result<GeomId, SceneError> {
+        Ok(builder.quadric(Quadric::Sphere {
             center: self.center.to_array(),
             radius: self.radius,
-        })
+        })?)
     }
 
     fn interaction(&self, ray: &Ray, hit: &Hit) -> Interaction {
@@ -105,12 +105,19 @@ impl ShapeModel for Sphere {
         let p = self.center + out * self.radius;
         let local = self.map.inverse_point(p);
         let n = out * self.sign;
+        let r = local.x.hypot(local.y);
+        let dp_dv = if r > 0.0 {
+            Vec3::new(local.z * local.x / r, local.z * local.y / r, -r)
+        } else {
+            Vec3::X
+        };
         Interaction {
             p,
             n,
             shading_normal: n,
             uv: Self::uv(local),
             dp_du: self.map.vector(Vec3::new(-local.y, local.x, 0.0)) * TAU,
+            dp_dv: self.map.vector(dp_dv) * PI,
             shape: 0,
         }
     }

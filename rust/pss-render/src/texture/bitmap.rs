@@ -136,6 +136,30 @@ impl TextureModel for Bitmap {
         }
     }
 
+    fn gradient(&self, uv: Vec2) -> Vec2 {
+        if self.filter == Filter::Nearest {
+            return Vec2::ZERO;
+        }
+        let [a, b] = self.to_uv;
+        let size = Vec2::new(self.width as f32, self.height as f32);
+        let p = size * Vec2::new(
+            a[0] * uv.x + a[1] * uv.y + a[2],
+            b[0] * uv.x + b[1] * uv.y + b[2],
+        ) - 0.5;
+        let (i, j) = (to_index(p.x), to_index(p.y));
+        let f = p - p.floor();
+        let at = |x: i32, y: i32| {
+            let value = self.texel(x, y);
+            if self.channels == 1 { value.x } else { luminance(value) }
+        };
+        let (f00, f10) = (at(i, j), at(i + 1, j));
+        let (f01, f11) = (at(i, j + 1), at(i + 1, j + 1));
+        let dx = (1.0 - f.y) * (f10 - f00) + f.y * (f11 - f01);
+        let dy = (1.0 - f.x) * (f01 - f00) + f.x * (f11 - f10);
+        // As Mitsuba: the resolution comes last, so a `to_uv` that turns a bitmap that is no square is off.
+        size * Vec2::new(a[0] * dx + b[0] * dy, a[1] * dx + b[1] * dy)
+    }
+
     fn eval_scalar(&self, uv: Vec2) -> f32 {
         let value = self.eval(uv);
         if self.channels == 1 { value.x } else { luminance(value) }

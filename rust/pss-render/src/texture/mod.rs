@@ -16,6 +16,10 @@ pub(crate) trait TextureModel {
     fn eval(&self, uv: Vec2) -> Rgb;
     /// The scalar at `uv`: Mitsuba's `eval_1`.
     fn eval_scalar(&self, uv: Vec2) -> f32;
+    /// The scalar's gradient over uv: Mitsuba's `eval_1_grad`.
+    fn gradient(&self, _uv: Vec2) -> Vec2 {
+        Vec2::ZERO
+    }
 }
 
 macro_rules! registry {
@@ -53,6 +57,11 @@ macro_rules! registry {
             pub fn eval_scalar(&self, uv: Vec2) -> f32 {
                 match self { $(Self::$variant(t) => t.eval_scalar(uv),)* }
             }
+
+            /// The scalar's gradient over uv (Mitsuba's `eval_1_grad`); zero where it has none.
+            pub fn gradient(&self, uv: Vec2) -> Vec2 {
+                match self { $(Self::$variant(t) => t.gradient(uv),)* }
+            }
         }
 
         /// The names of all textures.
@@ -63,4 +72,5 @@ macro_rules! registry {
 registry! {
     "constant" => Constant in constant;
     "bitmap" => Bitmap in bitmap;
+    "checkerboard" => Checkerboard in checkerboard;
 }

@@ -1,0 +1,60 @@
+//! A surface that shines along its normal alone, like a laser: no path from the camera can find that light,
+//! neither by NEE nor by chance. As Mitsuba's `path`, which draws it and gets nothing.
+
+use serde::Deserialize;
+
+use super::{Builder, EmitterModel, EmitterSample, one};
+use crate::arrays::check_index;
+use crate::error::SceneError;
+use crate::interaction::Interaction;
+use crate::math::{Rgb, Vec3};
+use crate::scene::Scene;
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Description {
+    pub(super) id: String,
+    shape: usize,
+    #[serde(default = "one")]
+    pub(super) sampling_weight: f32,
+}
+
+/// `directionalarea`
+#[derive(Debug)]
+pub struct DirectionalArea;
+
+impl DirectionalArea {
+    pub(super) fn build(d: Description, b: Builder<'_>) -> Result<Self, SceneError> {
+        check_index(d.shape, b.shapes, &format!("emitter {:?}", d.id), "shape")?;
+        Ok(Self)
+    }
+}
+
+impl EmitterModel for DirectionalArea {
+    fn sample_direction(
+        &self,
+        _scene: &Scene,
+        _reference: Vec3,
+        _u: [f32; 2],
+    ) -> Option<EmitterSample> {
+        None
+    }
+
+    fn pdf_direction(
+        &self,
+        _scene: &Scene,
+        _reference: Vec3,
+        _d: Vec3,
+        _surface: Option<&Interaction>,
+    ) -> f32 {
+        0.0
+    }
+
+    fn eval(&self, _scene: &Scene, _d: Vec3, _surface: Option<&Interaction>) -> Rgb {
+        Rgb::ZERO
+    }
+
+    fn can_be_hit(&self) -> bool {
+        false
+    }
+}
