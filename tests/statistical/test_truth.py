@@ -35,6 +35,9 @@ SPP = {
     "glossy_room": 256,
     "open_sky": 256,
     "quad": 16,
+    "sun_and_sky": 64,
+    "glass_room": 64,
+    "instances": 32,
 }
 """Of each run: more where two-bounce light is noisier."""
 SHIPPED = ("cornell-box", "teapot")
@@ -187,9 +190,10 @@ def test_instances_give_mitsubas_mean(k: int, artifacts: Path) -> None:
             "group": {"type": "ref", "id": "group"},
         }
     scene = mi.load_dict(court)
-    truth = truth_runs(scene, k=k, seeds=range(RUNS), spp=SPP)
+    spp = SPP["instances"]
+    truth = truth_runs(scene, k=k, seeds=range(RUNS), spp=spp)
     core = core_scene(scene)[0]
-    ours = our_runs(core, seeds=range(1000, 1000 + RUNS), spp=SPP, k=k)
+    ours = our_runs(core, seeds=range(1000, 1000 + RUNS), spp=spp, k=k)
     r = welch(truth, ours)
     assert r.p > ALPHA / 2, r.explain(artifacts)
     assert r.has_power, r.explain(artifacts)

@@ -192,7 +192,7 @@ def _sunsky(walk: Walk, obj: Any, where: str, _shape: Any, _index: int | None) -
     # The image's own axes: y is up.
     turned = linear @ np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
-    def directions(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    def directions(x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.float64]:
         """World directions of columns and rows; the last row is just above the horizon."""
         phi = 2 * np.pi * (x + 0.5) / SKY_WIDTH
         up = np.maximum(np.pi / 2 * (1 - y / (SKY_HEIGHT - 1)) ** 2, 1e-6)
@@ -203,7 +203,8 @@ def _sunsky(walk: Walk, obj: Any, where: str, _shape: Any, _index: int | None) -
     texels = _radiance(sky, directions(column, row)).reshape(SKY_HEIGHT, SKY_WIDTH, 3)
     # Where bilinear interpolation is at its worst: between four texels, on a coarse grid of places.
     x, y = np.meshgrid(np.arange(3, SKY_WIDTH - 1, 17), np.arange(0, SKY_HEIGHT - 1, 5))
-    between = sum(texels[y + j, x + i] for i in (0, 1) for j in (0, 1)).reshape(-1, 3) / 4
+    corners = [texels[y + j, x + i] for i in (0, 1) for j in (0, 1)]
+    between = np.mean(corners, axis=0).reshape(-1, 3)
     there = _radiance(sky, directions(x + 0.5, y + 0.5))
     if there.max() > 0:
         error = np.abs(between - there).max(axis=1) / np.maximum(there.max(axis=1), 1e-6)
@@ -242,7 +243,7 @@ def _sun(obj: Any, sky: Any, direction: NDArray[np.float64], up: NDArray[np.floa
     away /= np.linalg.norm(away)
 
     def excess(angles: NDArray[np.float64]) -> NDArray[np.float64]:
-        d = np.cos(angles)[:, None] * axis + np.sin(angles)[:, None] * away
+        d: NDArray[Any] = np.cos(angles)[:, None] * axis + np.sin(angles)[:, None] * away
         return _radiance(obj, d) - _radiance(sky, d)
 
     # Shown nowhere else; where its light ends is blurred by more than six digits.

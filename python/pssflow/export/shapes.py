@@ -85,10 +85,10 @@ def _mesh(walk: Walk, obj: Any, where: str) -> Entry:
     normals = texcoords = None
     if obj.has_vertex_normals():
         normals = rows(obj.vertex_normals_buffer(), 3, np.float32, "vertex_normals")
-        bad = ~np.isfinite(normals).all(axis=1)
+        bad = np.logical_not(np.isfinite(normals).all(axis=1))
         if bad.any():
             # A normal of no length leaves the choice to the triangle's other two, or to its facet.
-            normals = np.where(bad[:, None], np.float32(0), normals)
+            normals = np.where(np.expand_dims(bad, 1), np.float32(0), normals)
             walk.notes.append(f'"{where}": {bad.sum()} vertex normals are not finite and left out')
     if obj.has_vertex_texcoords():
         texcoords = rows(obj.vertex_texcoords_buffer(), 2, np.float32, "vertex_texcoords")

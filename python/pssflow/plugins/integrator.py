@@ -154,9 +154,7 @@ def define() -> Callable[[Any], Any]:
                 seed=_scalar(seed),
                 sample_count=camera.sampler().sample_count(),
             )
-            self.result = run(
-                Scene(scene, camera), self.choice, plan, self.progress
-            )
+            self.result = run(Scene(scene, camera), self.choice, plan, self.progress)
             _fill(camera.film(), self.result.image)
             return camera.film().develop() if develop else mi.TensorXf()
 
