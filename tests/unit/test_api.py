@@ -550,13 +550,12 @@ def test_scenes_that_are_none(scalar_variant, tmp_path):
         quick(3)
     with pytest.raises(ValueError, match=r"scene dictionary: .*klein-bottle"):
         quick({"type": "scene", "shape": {"type": "klein-bottle"}})
-    with pytest.raises(pssflow.UnsupportedError, match='"instance"'):
+    with pytest.raises(pssflow.UnsupportedError, match='"hair"'):
         quick(
             {
                 "type": "scene",
                 "sensor": {"type": "perspective"},
-                "shapes": {"type": "shapegroup", "ball": {"type": "sphere"}},
-                "copy": {"type": "instance", "shapes": {"type": "ref", "id": "shapes"}},
+                "ball": {"type": "sphere", "bsdf": {"type": "hair"}},
             }
         )
 

@@ -21,12 +21,14 @@ pub(crate) struct Description {
 
 /// `directionalarea`
 #[derive(Debug)]
-pub struct DirectionalArea;
+pub struct DirectionalArea {
+    shape: usize,
+}
 
 impl DirectionalArea {
     pub(super) fn build(d: Description, b: Builder<'_>) -> Result<Self, SceneError> {
         check_index(d.shape, b.shapes, &format!("emitter {:?}", d.id), "shape")?;
-        Ok(Self)
+        Ok(Self { shape: d.shape })
     }
 }
 
@@ -56,5 +58,9 @@ impl EmitterModel for DirectionalArea {
 
     fn can_be_hit(&self) -> bool {
         false
+    }
+
+    fn shape(&self) -> Option<usize> {
+        Some(self.shape)
     }
 }
