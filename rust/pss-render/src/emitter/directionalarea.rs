@@ -6,8 +6,7 @@ use serde::Deserialize;
 use super::{Builder, EmitterModel, EmitterSample, one};
 use crate::arrays::check_index;
 use crate::error::SceneError;
-use crate::interaction::Interaction;
-use crate::math::{Rgb, Vec3};
+use crate::math::Vec3;
 use crate::scene::Scene;
 
 #[derive(Debug, Deserialize)]
@@ -40,20 +39,6 @@ impl EmitterModel for DirectionalArea {
         _u: [f32; 2],
     ) -> Option<EmitterSample> {
         None
-    }
-
-    fn pdf_direction(
-        &self,
-        _scene: &Scene,
-        _reference: Vec3,
-        _d: Vec3,
-        _surface: Option<&Interaction>,
-    ) -> f32 {
-        0.0
-    }
-
-    fn eval(&self, _scene: &Scene, _d: Vec3, _surface: Option<&Interaction>) -> Rgb {
-        Rgb::ZERO
     }
 
     fn can_be_hit(&self) -> bool {

@@ -35,17 +35,22 @@ pub(crate) trait EmitterModel {
     ) -> Option<EmitterSample>;
 
     /// Density of [`EmitterModel::sample_direction`] for the unit direction `d`, that hit `surface` or
-    /// escaped.
+    /// escaped; 0 for light that no ray can find.
     fn pdf_direction(
         &self,
-        scene: &Scene,
-        reference: Vec3,
-        d: Vec3,
-        surface: Option<&Interaction>,
-    ) -> f32;
+        _scene: &Scene,
+        _reference: Vec3,
+        _d: Vec3,
+        _surface: Option<&Interaction>,
+    ) -> f32 {
+        0.0
+    }
 
-    /// Radiance that arrives along a ray of direction `d` that hit `surface` or escaped.
-    fn eval(&self, scene: &Scene, d: Vec3, surface: Option<&Interaction>) -> Rgb;
+    /// Radiance that arrives along a ray of direction `d` that hit `surface` or escaped; none of light that
+    /// no ray can find.
+    fn eval(&self, _scene: &Scene, _d: Vec3, _surface: Option<&Interaction>) -> Rgb {
+        Rgb::ZERO
+    }
 
     /// Whether it surrounds the scene, so that escaping rays see it.
     fn is_environment(&self) -> bool {

@@ -5,7 +5,6 @@ use serde::Deserialize;
 use super::{Builder, EmitterModel, EmitterSample, one};
 use crate::arrays::check_all_finite;
 use crate::error::SceneError;
-use crate::interaction::Interaction;
 use crate::math::{Rgb, Vec3};
 use crate::scene::Scene;
 
@@ -49,14 +48,6 @@ impl EmitterModel for Point {
             pdf: 1.0,
             delta: true,
         })
-    }
-
-    fn pdf_direction(&self, _scene: &Scene, _reference: Vec3, _d: Vec3, _surface: Option<&Interaction>) -> f32 {
-        0.0
-    }
-
-    fn eval(&self, _scene: &Scene, _d: Vec3, _surface: Option<&Interaction>) -> Rgb {
-        Rgb::ZERO
     }
 
     fn can_be_hit(&self) -> bool {
