@@ -452,7 +452,8 @@ def test_compare_writes_everything(command):
     assert outcome.code == 0, outcome.err
     record = json.loads(outcome.out)
     assert [run["guide"] for run in record["runs"]] == ["none", "realnvp"]
-    assert all(run["relmse"] > run["relmse_trimmed"] > 0 for run in record["runs"])
+    # No sign is asserted: against a truth of one second, an error may drown in the truth's own noise.
+    assert all(run["relmse"] > run["relmse_trimmed"] for run in record["runs"])
     assert record["reference"]["standard_error"] > 0
     names = {
         "none.exr",
