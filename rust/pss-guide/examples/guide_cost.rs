@@ -33,8 +33,8 @@ fn main() -> Result<(), GuideError> {
         f: &f,
         f_max: &f,
         g: &g,
-        pixel: &[],
         zeros: 0,
+        ..Records::default()
     };
     let options = serde_json::Map::from_iter([("epochs".to_owned(), 2.into())]);
 

@@ -13,6 +13,18 @@ pub enum GuideError {
         /// All names, joined by commas.
         known: String,
     },
+    /// Two factors of a composite model the same numbers.
+    #[error(
+        "guide {name:?}: {first} and {second} model the same numbers; join guides of different decisions"
+    )]
+    Overlap {
+        /// The composite.
+        name: String,
+        /// One factor.
+        first: &'static str,
+        /// The other.
+        second: &'static str,
+    },
     /// The guide has no option of this name.
     #[error("guide {guide:?} has no option {option:?} (known: {known})")]
     UnknownOption {

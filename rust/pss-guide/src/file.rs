@@ -18,6 +18,7 @@ use std::path::Path;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde_json::Value;
 
+use crate::composite::Composite;
 use crate::{Guide, GuideError, Header, registry};
 
 /// Version of the file format that this build writes and reads.
@@ -27,11 +28,13 @@ const FORMAT: &str = "pssflow-guide";
 
 /// What a guide puts into its file.
 #[derive(Debug)]
-pub(crate) struct Contents {
-    pub(crate) guide: String,
-    pub(crate) config: Value,
+pub struct Contents {
+    /// Name in the registry; of a composite, the names of its factors joined by `+`.
+    pub guide: String,
+    /// Dimensions, options and facts.
+    pub config: Value,
     /// Name, shape, values.
-    pub(crate) tensors: Vec<(String, Vec<usize>, Vec<f32>)>,
+    pub tensors: Vec<(String, Vec<usize>, Vec<f32>)>,
 }
 
 /// Reads a guide that was fitted for `expected`.
@@ -64,11 +67,19 @@ pub fn load(path: &Path, expected: &Header) -> Result<Box<dyn Guide>, GuideError
 /// Those of [`load`], but for [`GuideError::Foreign`].
 pub fn load_unchecked(path: &Path) -> Result<(Box<dyn Guide>, Header), GuideError> {
     let (header, contents) = read(path)?;
-    let spec = registry::find(&contents.guide)?;
-    let guide = (spec.restore)(contents).map_err(|what| GuideError::Corrupt {
+    let corrupt = |what| GuideError::Corrupt {
         path: path.to_owned(),
         what,
-    })?;
+    };
+    let guide = if contents.guide.contains('+') {
+        for name in contents.guide.split('+') {
+            registry::find(name)?;
+        }
+        Composite::restore(contents).map_err(corrupt)?
+    } else {
+        let spec = registry::find(&contents.guide)?;
+        (spec.restore)(contents).map_err(corrupt)?
+    };
     Ok((guide, header))
 }
 

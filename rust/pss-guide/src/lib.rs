@@ -14,11 +14,13 @@
 //! and no Python, reads no environment variable and draws random numbers for training only: a sample is
 //! made from the caller's uniform numbers, in place.
 
+mod composite;
 mod error;
 mod file;
 mod flow;
 mod normal;
 mod options;
+mod recipe;
 mod records;
 mod registry;
 
@@ -27,9 +29,10 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 pub use error::GuideError;
-pub use file::{FORMAT_VERSION, load, load_unchecked};
+pub use file::{Contents, FORMAT_VERSION, load, load_unchecked};
 pub use flow::options::{Prior, RealNvpOptions};
-pub use records::Records;
+pub use recipe::{ALIASES, Recipe};
+pub use records::{Emitter, Records};
 pub use registry::{FitFn, GuideSpec, find, fit, registry};
 
 /// What a number of a path decides; a guide models some of these.
@@ -113,11 +116,29 @@ pub trait Guide: Send + Sync + std::fmt::Debug {
     /// Name, configuration and facts, for records and tables.
     fn describe(&self) -> serde_json::Value;
 
+    /// Whether `sample` and `density` want a context a row for a decision that the guide models.
+    fn looks_at_contexts(&self, decision: Decision) -> bool {
+        decision != Decision::Path
+    }
+
+    /// What a file of the guide holds; `None` for a guide of another make, which keeps its own files.
+    fn contents(&self) -> Option<Contents> {
+        None
+    }
+
     /// Writes the guide; the file appears complete or not at all.
     ///
     /// # Errors
     /// [`GuideError::Io`] if the file cannot be written.
-    fn save(&self, path: &Path, header: &Header) -> Result<(), GuideError>;
+    fn save(&self, path: &Path, header: &Header) -> Result<(), GuideError> {
+        match self.contents() {
+            Some(contents) => file::write(path, header, &contents),
+            None => Err(GuideError::Io {
+                path: path.to_owned(),
+                source: std::io::Error::other("this guide has no file of its own"),
+            }),
+        }
+    }
 }
 
 /// Loss after an epoch.

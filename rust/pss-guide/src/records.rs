@@ -1,21 +1,35 @@
 //! Pilot paths as training data.
 
+use std::ops::Range;
+
 use pss_rng::{Purpose, Stream};
 
-use crate::GuideError;
+use crate::{Context, Decision, Guide, GuideError};
+
+/// An emitter as guides see it: how the emitter's number chooses it, and what kind of light it is.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Emitter {
+    /// Upper end of the interval of [0, 1) that chooses it; the lower end is the emitter's before it.
+    pub cdf: f32,
+    /// Whether it surrounds the scene, so that what of it is seen depends on the surface's normal.
+    pub environment: bool,
+}
 
 /// Paths to learn from, one row each.
 ///
-/// | field   | shape     | meaning                                                          |
-/// |---------|-----------|------------------------------------------------------------------|
-/// | `u`     | `(n, d)`  | primary numbers, row-major                                       |
-/// | `f`     | `n`       | luminance of the undivided contribution                          |
-/// | `f_max` | `n`       | its largest RGB component                                        |
-/// | `g`     | `n`       | density that `u` was drawn from, 1 for uniform                   |
-/// | `pixel` | `n` or 0  | film position in [0, 1)²                                         |
+/// | field      | shape      | meaning                                                                        |
+/// |------------|------------|--------------------------------------------------------------------------------|
+/// | `u`        | `(n, d)`   | primary numbers, row-major                                                     |
+/// | `f`        | `n`        | luminance of the undivided contribution, both terms                            |
+/// | `f_bsdf`   | `n` or 0   | the part of it that the emitter's and the light's numbers do not decide        |
+/// | `f_max`    | `n`        | its largest RGB component                                                      |
+/// | `g`        | `n`        | density that `u` was drawn from, times the share of such paths that was kept   |
+/// | `g_bsdf`   | `n` or 0   | the same for the directions' numbers alone (a marginal of `g`); `g` if empty   |
+/// | `contexts` | `(n, k)` or 0 | x₁ … x_k; the last one's `emitter` is the one chosen                        |
+/// | `pixel`    | `n` or 0   | film position in [0, 1)²                                                       |
 ///
-/// Only non-zero paths need be given: zeros carry no gradient and are counted in `zeros`.
-#[derive(Clone, Copy, Debug)]
+/// Only non-zero paths need be given: zeros carry no gradient and are counted in `zeros`. `Default` has no path.
+#[derive(Clone, Copy, Debug, Default)]
 pub struct Records<'a> {
     /// Numbers per path.
     pub dims: usize,
@@ -23,13 +37,21 @@ pub struct Records<'a> {
     pub u: &'a [f32],
     /// Luminances, `n`.
     pub f: &'a [f32],
+    /// Luminances of the BSDF-sampled term, `n` (or none where there is no such term).
+    pub f_bsdf: &'a [f32],
     /// Largest RGB components, `n`.
     pub f_max: &'a [f32],
     /// Densities of the draw, `n`.
     pub g: &'a [f32],
+    /// Their marginals over the directions' numbers, `n` (or none: the same as `g`).
+    pub g_bsdf: &'a [f32],
+    /// Vertices, `n · k` (or none).
+    pub contexts: &'a [Context],
     /// Film positions, `n` (or none).
     pub pixel: &'a [[f32; 2]],
-    /// Paths without light, not given.
+    /// The scene's emitters in the order of the emitter's number (or none: one, of area).
+    pub emitters: &'a [Emitter],
+    /// Paths without light, not given; with thinned records, as many as that share of them.
     pub zeros: u64,
 }
 
@@ -47,6 +69,56 @@ pub(crate) struct Usable {
 }
 
 impl Records<'_> {
+    /// Bounces k of paths with 2k + 1 numbers.
+    pub fn bounces(&self) -> usize {
+        self.dims.saturating_sub(1) / 2
+    }
+
+    /// The columns of a decision, for each vertex where it is taken.
+    fn columns(&self, decision: Decision) -> impl Iterator<Item = (usize, Range<usize>)> + use<> {
+        let k = self.bounces();
+        let (vertices, width) = match decision {
+            Decision::Path => (0..1, self.dims),
+            Decision::Direction => (0..k.saturating_sub(1), 2),
+            Decision::Emitter | Decision::Light => (k.saturating_sub(1)..k, 1),
+        };
+        let at = move |vertex: usize| match decision {
+            Decision::Path | Decision::Direction => vertex * 2..vertex * 2 + width,
+            Decision::Emitter => 2 * k - 2..2 * k - 1,
+            Decision::Light => 2 * k - 1..2 * k + 1,
+        };
+        vertices.map(move |vertex| (vertex, at(vertex)))
+    }
+
+    /// Multiplies into `q` the guide's density of each path, decision by decision.
+    pub(crate) fn multiply_densities(&self, guide: &dyn Guide, q: &mut [f32]) {
+        const CHUNK: usize = 4096;
+        let (mut u, mut contexts, mut each) = (Vec::new(), Vec::new(), Vec::new());
+        for &decision in guide.models() {
+            for (vertex, columns) in self.columns(decision) {
+                for first in (0..q.len()).step_by(CHUNK) {
+                    let rows = first..(first + CHUNK).min(q.len());
+                    u.clear();
+                    contexts.clear();
+                    for row in rows.clone() {
+                        u.extend_from_slice(&self.u[row * self.dims..][columns.clone()]);
+                    }
+                    if guide.looks_at_contexts(decision) {
+                        let k = self.bounces();
+                        contexts.extend(rows.clone().map(|row| self.contexts[row * k + vertex]));
+                    }
+                    each.clear();
+                    each.resize(rows.len(), 1.0);
+                    guide.density(decision, &contexts, &u, &mut each);
+                    q[rows]
+                        .iter_mut()
+                        .zip(&each)
+                        .for_each(|(q, each)| *q *= each);
+                }
+            }
+        }
+    }
+
     /// Drops zeros, what is not finite, and what is brighter than the quantile `keep` of the rest.
     pub(crate) fn usable(&self, keep: f64) -> Result<Usable, GuideError> {
         let rows = self.f_max.len();
@@ -65,8 +137,15 @@ impl Records<'_> {
         shape("u", self.u.len(), rows.saturating_mul(self.dims))?;
         shape("f", self.f.len(), rows)?;
         shape("g", self.g.len(), rows)?;
-        if !self.pixel.is_empty() {
-            shape("pixel", self.pixel.len(), rows)?;
+        for (array, found, expected) in [
+            ("pixel", self.pixel.len(), rows),
+            ("f_bsdf", self.f_bsdf.len(), rows),
+            ("g_bsdf", self.g_bsdf.len(), rows),
+            ("contexts", self.contexts.len(), rows * self.bounces()),
+        ] {
+            if found > 0 {
+                shape(array, found, expected)?;
+            }
         }
 
         let finite = |r: usize| {
@@ -157,8 +236,8 @@ mod tests {
             f,
             f_max: f,
             g,
-            pixel: &[],
             zeros: 3,
+            ..Records::default()
         }
     }
 

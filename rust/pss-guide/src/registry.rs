@@ -4,7 +4,7 @@ use serde_json::{Map, Value};
 
 use crate::file::Contents;
 use crate::flow::{Domain, RealNvp, options::RealNvpOptions};
-use crate::{Decision, Fit, Guide, GuideError, Records, options};
+use crate::{Decision, Fit, Guide, GuideError, Recipe, Records, options};
 
 /// Signature of [`GuideSpec::fit`]: options, data, seed, progress.
 pub type FitFn = fn(
@@ -86,7 +86,7 @@ pub fn find(name: &str) -> Result<&'static GuideSpec, GuideError> {
         })
 }
 
-/// Fits the guide `name` to `records`.
+/// Fits the guide `name`, or several joined by `+` (see [`Recipe::parse`]), to `records`.
 ///
 /// `options` are written over the guide's defaults. `progress` is called with the share done, a few
 /// times per second at least, and cancels by returning false. The result depends on the arguments
@@ -103,7 +103,7 @@ pub fn find(name: &str) -> Result<&'static GuideSpec, GuideError> {
 /// // Light arrives only where u₀ < ½.
 /// let u: Vec<f32> = (0..4000).flat_map(|i| [(i % 63) as f32 / 126.0, (i % 64) as f32 / 64.0]).collect();
 /// let one = vec![1.0; 4000];
-/// let records = Records { dims: 2, u: &u, f: &one, f_max: &one, g: &one, pixel: &[], zeros: 4000 };
+/// let records = Records { dims: 2, u: &u, f: &one, f_max: &one, g: &one, zeros: 4000, ..Records::default() };
 /// let options = serde_json::json!({ "hidden": 16, "layers": 2 });
 /// let fit = fit("realnvp-logit", options.as_object().unwrap(), &records, 1, &mut |_| true)?;
 /// let mut q = [0.0; 2];
@@ -118,5 +118,5 @@ pub fn fit(
     seed: u64,
     progress: &mut dyn FnMut(f32) -> bool,
 ) -> Result<Fit, GuideError> {
-    (find(name)?.fit)(options, records, seed, progress)
+    Recipe::parse(name, options)?.fit(records, seed, progress)
 }

@@ -53,8 +53,8 @@ impl Guide {
                 f: &f,
                 f_max: &f_max,
                 g: &g,
-                pixel: &[],
                 zeros,
+                ..Records::default()
             };
             use pssflow::Progress;
             pss_guide::fit(name, &options, &records, seed, &mut |done| {

@@ -56,19 +56,16 @@ struct Request {
     threads: usize,
 }
 
-/// A guide of the registry, with options.
-struct Named {
-    spec: &'static pss_guide::GuideSpec,
-    options: Map<String, Value>,
-}
+/// A guide of the registry, or several, with options.
+struct Named(pss_guide::Recipe);
 
 impl Learner for Named {
     fn name(&self) -> &str {
-        self.spec.name
+        self.0.name()
     }
 
     fn seconds_per_path(&self, dims: usize) -> f64 {
-        (self.spec.seconds_per_path)(&self.options, dims)
+        self.0.seconds_per_path(dims)
     }
 
     fn fit(
@@ -77,7 +74,7 @@ impl Learner for Named {
         seed: u64,
         progress: &mut dyn FnMut(f32) -> bool,
     ) -> Result<pss_guide::Fit, pss_guide::GuideError> {
-        (self.spec.fit)(&self.options, records, seed, progress)
+        self.0.fit(records, seed, progress)
     }
 }
 
@@ -377,11 +374,11 @@ impl Scene {
                 Ok(GuideChoice::Learn(Arc::new(object)))
             }
             name => {
-                let spec = pss_guide::find(name).map_err(errors::guide)?;
                 // Before minutes of pilot, not after.
-                (spec.validate)(&request.guide_options).map_err(errors::guide)?;
-                let options = request.guide_options.clone();
-                Ok(GuideChoice::Learn(Arc::new(Named { spec, options })))
+                let recipe = pss_guide::Recipe::parse(name, &request.guide_options);
+                Ok(GuideChoice::Learn(Arc::new(Named(
+                    recipe.map_err(errors::guide)?,
+                ))))
             }
         }
     }

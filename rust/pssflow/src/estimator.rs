@@ -319,6 +319,7 @@ impl Run<'_> {
             g: &records.g,
             pixel: &records.pixel,
             zeros: records.zeros,
+            ..Records::default()
         };
         let fit = learner.fit(&training, self.options.seed, &mut report);
         self.seconds.fit = start.elapsed().as_secs_f64();

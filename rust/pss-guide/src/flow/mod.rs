@@ -25,8 +25,6 @@ mod train;
 mod twin;
 mod weights;
 
-use std::path::Path;
-
 use pss_rng::{Purpose, Stream, to_unit};
 use serde_json::{Map, Value, json};
 
@@ -34,9 +32,7 @@ use self::kernel::{Direction, Kernel};
 use self::options::{Prior, RealNvpOptions};
 use self::weights::{Shape, Weights};
 use crate::file::{self, Contents};
-use crate::{
-    Context, Decision, Fit, Guide, GuideError, Header, Records, normal, options as json_options,
-};
+use crate::{Context, Decision, Fit, Guide, GuideError, Records, normal, options as json_options};
 
 /// Base samples behind [`Guide::mass_outside`].
 const OUTSIDE_SAMPLES: u32 = 65_536;
@@ -400,7 +396,7 @@ impl Guide for RealNvp {
         })
     }
 
-    fn save(&self, path: &Path, header: &Header) -> Result<(), GuideError> {
+    fn contents(&self) -> Option<Contents> {
         let names = self.weights.shape.tensors();
         let tensors = names
             .into_iter()
@@ -412,14 +408,10 @@ impl Guide for RealNvp {
             "outside": self.outside,
             "options": json_options::to_map(&self.options),
         });
-        file::write(
-            path,
-            header,
-            &Contents {
-                guide: self.name().to_owned(),
-                config,
-                tensors,
-            },
-        )
+        Some(Contents {
+            guide: self.name().to_owned(),
+            config,
+            tensors,
+        })
     }
 }

@@ -35,8 +35,8 @@ pub(crate) fn two_paths() -> Records<'static> {
         f: &[1.0; 2],
         f_max: &[1.0; 2],
         g: &[1.0; 2],
-        pixel: &[],
         zeros: 0,
+        ..Records::default()
     }
 }
 
@@ -87,8 +87,8 @@ pub(crate) fn fit_with(
         f: &f,
         f_max: &f,
         g: &g,
-        pixel: &[],
         zeros: 0,
+        ..Records::default()
     };
     fit(name, &options, &records, seed, &mut |_| true).unwrap()
 }

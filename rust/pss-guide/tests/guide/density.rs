@@ -164,8 +164,8 @@ fn two_moons_are_learned() {
         f: &one,
         f_max: &one,
         g: &one,
-        pixel: &[],
         zeros: 0,
+        ..Records::default()
     };
     for spec in registry() {
         let guide = fit(
@@ -199,8 +199,8 @@ fn the_hypercube_prior_fails_as_the_thesis_found() {
         f: &f,
         f_max: &f,
         g: &g,
-        pixel: &[],
         zeros: 0,
+        ..Records::default()
     };
     let fitted = fit(
         "realnvp",

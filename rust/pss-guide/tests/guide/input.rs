@@ -58,8 +58,8 @@ fn bad_paths_are_dropped_counted_or_refused() {
             f: &f,
             f_max: &f,
             g: &g,
-            pixel: &[],
             zeros: 9,
+            ..Records::default()
         };
         let fitted = fit(
             spec.name,
@@ -112,8 +112,8 @@ fn a_fit_can_be_cancelled_and_reports_its_progress() {
             f: &f,
             f_max: &f,
             g: &g,
-            pixel: &[],
             zeros: 0,
+            ..Records::default()
         };
         let mut seen = Vec::new();
         let mut cancel = |share| {
@@ -151,8 +151,8 @@ fn a_diverging_fit_says_where_and_what_to_do() {
         f: &f,
         f_max: &f,
         g: &g,
-        pixel: &[],
         zeros: 0,
+        ..Records::default()
     };
     let given = options(&[
         ("learning_rate", 1.0.into()),

@@ -1,0 +1,153 @@
+//! What is to be fitted: one line of the registry, or several joined by `+`, with their options.
+
+use serde_json::{Map, Value};
+
+use crate::composite::Composite;
+use crate::registry::{self, GuideSpec};
+use crate::{Decision, Fit, Guide, GuideError, Records};
+
+/// Names that stand for a composite.
+pub const ALIASES: [(&str, &str); 1] = [("table", "direction-table+emitter-table+light-table")];
+
+/// Share of uniform paths that a factor assumes in the mixture when it looks past the factors before it.
+const DEFENSIVE: f32 = 0.1;
+
+/// One guide, or a product of guides that model different decisions.
+#[derive(Clone, Debug)]
+pub struct Recipe {
+    name: String,
+    factors: Vec<(&'static GuideSpec, Map<String, Value>)>,
+}
+
+impl Recipe {
+    /// Understands `name`, a registry line, several joined by `+`, or one of [`ALIASES`], and checks the options:
+    /// those of the guide itself, or for a composite one object a factor, by the factor's name.
+    ///
+    /// # Errors
+    /// [`GuideError::UnknownGuide`], [`GuideError::UnknownOption`], [`GuideError::Option`], and
+    /// [`GuideError::Overlap`] where two factors model the same decision.
+    pub fn parse(name: &str, options: &Map<String, Value>) -> Result<Self, GuideError> {
+        let alias = ALIASES.iter().find(|(alias, _)| *alias == name);
+        let parts: Vec<&str> = alias.map_or(name, |(_, parts)| parts).split('+').collect();
+        let mut factors: Vec<(&'static GuideSpec, Map<String, Value>)> = Vec::new();
+        for part in &parts {
+            let spec = registry::find(part)?;
+            if let Some((other, _)) = factors.iter().find(|(f, _)| overlap(f.models, spec.models)) {
+                return Err(GuideError::Overlap {
+                    name: name.to_owned(),
+                    first: other.name,
+                    second: spec.name,
+                });
+            }
+            let own = if parts.len() == 1 {
+                options.clone()
+            } else {
+                part_options(spec, options)?
+            };
+            (spec.validate)(&own)?;
+            factors.push((spec, own));
+        }
+        if let Some(stranger) = options
+            .keys()
+            .find(|key| parts.len() > 1 && !parts.contains(&key.as_str()))
+        {
+            return Err(GuideError::UnknownOption {
+                guide: name.to_owned(),
+                option: stranger.clone(),
+                known: parts.join(", "),
+            });
+        }
+        Ok(Self {
+            name: name.to_owned(),
+            factors,
+        })
+    }
+
+    /// As asked for.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// Registry lines of the factors.
+    pub fn specs(&self) -> impl Iterator<Item = &'static GuideSpec> + '_ {
+        self.factors.iter().map(|(spec, _)| *spec)
+    }
+
+    /// Seconds of training that each path costs on one core, roughly.
+    pub fn seconds_per_path(&self, dims: usize) -> f64 {
+        let each =
+            |(spec, options): &(&GuideSpec, Map<_, _>)| (spec.seconds_per_path)(options, dims);
+        self.factors.iter().map(each).sum()
+    }
+
+    /// Fits the factors one after the other, each to what those before it leave: paths count with f²/g of the
+    /// density that they would have had in a mixture with the factors so far.
+    ///
+    /// # Errors
+    /// As [`crate::fit`].
+    pub fn fit(
+        &self,
+        records: &Records<'_>,
+        seed: u64,
+        progress: &mut dyn FnMut(f32) -> bool,
+    ) -> Result<Fit, GuideError> {
+        if let [(spec, options)] = &self.factors[..] {
+            return (spec.fit)(options, records, seed, progress);
+        }
+        let start = std::time::Instant::now();
+        let (mut g, mut fitted) = (records.g.to_vec(), Vec::<Fit>::new());
+        let mut q = vec![1.0f32; records.f.len()];
+        for (i, (spec, options)) in self.factors.iter().enumerate() {
+            let seen = Records { g: &g, ..*records };
+            let share = |done: f32| (i as f32 + done) / self.factors.len() as f32;
+            let fit = (spec.fit)(options, &seen, seed, &mut |done| progress(share(done)))?;
+            if i + 1 < self.factors.len() {
+                records.multiply_densities(&*fit.guide, &mut q);
+                for ((g, &drawn), &q) in g.iter_mut().zip(records.g).zip(&q) {
+                    *g = drawn * (DEFENSIVE + (1.0 - DEFENSIVE) * q);
+                }
+            }
+            fitted.push(fit);
+        }
+        Ok(Fit {
+            history: Vec::new(),
+            seconds: start.elapsed().as_secs_f64(),
+            dropped_nonfinite: fitted
+                .iter()
+                .map(|f| f.dropped_nonfinite)
+                .max()
+                .unwrap_or(0),
+            outliers_removed: fitted.iter().map(|f| f.outliers_removed).max().unwrap_or(0),
+            trained_on: fitted.iter().map(|f| f.trained_on).max().unwrap_or(0),
+            samples: fitted.iter().map(|f| f.samples).max().unwrap_or(0),
+            guide: Box::new(Composite::new(
+                fitted
+                    .into_iter()
+                    .map(|f| f.guide)
+                    .collect::<Vec<Box<dyn Guide>>>(),
+                records.dims,
+            )),
+        })
+    }
+}
+
+/// A guide over the whole path models every other decision, too.
+fn overlap(a: &[Decision], b: &[Decision]) -> bool {
+    a.contains(&Decision::Path) || b.contains(&Decision::Path) || a.iter().any(|d| b.contains(d))
+}
+
+fn part_options(
+    spec: &'static GuideSpec,
+    options: &Map<String, Value>,
+) -> Result<Map<String, Value>, GuideError> {
+    match options.get(spec.name) {
+        None => Ok(Map::new()),
+        Some(Value::Object(own)) => Ok(own.clone()),
+        Some(other) => Err(crate::options::bad(
+            spec.name,
+            spec.name,
+            other,
+            "in a composite, an object of this factor's options",
+        )),
+    }
+}
