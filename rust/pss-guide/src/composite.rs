@@ -61,8 +61,8 @@ impl Composite {
     }
 
     fn factor(&self, decision: Decision) -> Option<&dyn Guide> {
-        let models = |f: &&Box<dyn Guide>| f.models().contains(&decision);
-        self.factors.iter().find(models).map(|f| &**f)
+        let mut factors = self.factors.iter().map(|f| &**f);
+        factors.find(|f| f.models().contains(&decision))
     }
 }
 
