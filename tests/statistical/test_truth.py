@@ -132,6 +132,19 @@ def test_more_light_is_refused(name: str, factor: float) -> None:
     assert welch(_truth(name, 2), np.float32(factor) * _ours_by_default(name)).p < ALPHA / 2
 
 
+@pytest.mark.long
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize(("name", "times"), [("glossy_room", 5), ("open_sky", 5), ("teapot", 12)])
+def test_one_per_cent_is_refused(name: str, times: int, artifacts: Path) -> None:
+    """Power: with more seeds, one per cent more light is seen on the noisier scenes, too, and the truth still is not."""
+    seeds = range(RUNS * times)
+    truth = truth_runs(_load(name), k=2, seeds=seeds, spp=SPP[name])
+    ours = _ours(name, seeds=range(1000, 1000 + len(seeds)))
+    r = welch(truth, ours)
+    assert r.p > ALPHA / 2, r.explain(artifacts)
+    assert welch(truth, np.float32(1.01) * ours).p < ALPHA / 2
+
+
 def test_one_bounce_less_is_refused() -> None:
     """Power: a renderer that is off by a bounce does not pass for want of samples."""
     assert welch(_truth("teapot", 2), _ours("teapot", k=1)).p < 1e-12
