@@ -136,7 +136,7 @@ def test_more_light_is_refused(name: str, factor: float) -> None:
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize(("name", "times"), [("glossy_room", 5), ("open_sky", 5), ("teapot", 12)])
 def test_one_per_cent_is_refused(name: str, times: int, artifacts: Path) -> None:
-    """Power: with more seeds, one per cent more light is seen on the noisier scenes, too, and the truth still is not."""
+    """Power: with more seeds, one per cent more light is seen on noisy scenes, too, while the truth still passes."""
     seeds = range(RUNS * times)
     truth = truth_runs(_load(name), k=2, seeds=seeds, spp=SPP[name])
     ours = _ours(name, seeds=range(1000, 1000 + len(seeds)))

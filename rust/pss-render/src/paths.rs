@@ -63,7 +63,7 @@ impl RayLog {
         self.len() == 0
     }
 
-    /// Sends them again, as [`Tracer::trace`] does, and returns how many met something.
+    /// Sends them again, as [`crate::Tracer::trace`] does, and returns how many met something.
     pub fn replay(&self, accel: &embree4::Scene) -> u64 {
         let mut met = 0;
         let mut hits: [Option<Hit>; 16] = [None; 16];
