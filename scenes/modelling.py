@@ -43,15 +43,20 @@ class Mesh(NamedTuple):
     uv: F64
     faces: NDArray[np.int64]
 
-    def moved(self, to: ArrayLike = (0, 0, 0), *, size: float = 1.0, ahead: Point = (0, 0, 1)) -> Mesh:
+    def moved(
+        self, to: ArrayLike = (0, 0, 0), *, size: float = 1.0, ahead: Point = (0, 0, 1)
+    ) -> Mesh:
         """Scaled by `size`, turned about +y until +z looks along `ahead`, then moved by `to`."""
         x, _, z = unit(np.array([ahead[0], 0.0, ahead[2]]))
 
         def turn(v: F64) -> F64:
-            return np.stack([z * v[:, 0] + x * v[:, 2], v[:, 1], z * v[:, 2] - x * v[:, 0]], axis=-1)
+            return np.stack(
+                [z * v[:, 0] + x * v[:, 2], v[:, 1], z * v[:, 2] - x * v[:, 0]], axis=-1
+            )
 
         return self._replace(
-            positions=turn(self.positions * size) + np.asarray(to, float), normals=turn(self.normals)
+            positions=turn(self.positions * size) + np.asarray(to, float),
+            normals=turn(self.normals),
         )
 
 
@@ -74,7 +79,7 @@ def fraction(i: int, step: float = 0.6180339887498949) -> float:
 
 
 def circle(n: int) -> F64:
-    """n points (cos, sin) of the unit circle, (n, 2), by halving quarters; n = 4, 8, 16, …."""
+    """Points (cos, sin) of the unit circle, `n` rows of two, by halving quarters; n = 4, 8, 16, …."""
     if n < 4 or n & (n - 1):
         raise ValueError(f"n = {n} points of a circle: halving quarters gives 4, 8, 16, …")
     points = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
@@ -135,7 +140,10 @@ def curve(points: Run, steps: int) -> Run:
         a, b, c, d = p[i : i + 4]
         for step in range(1, steps + 1):
             t = step / steps
-            x = 0.5 * (2 * b + t * ((c - a) + t * ((2 * a - 5 * b + 4 * c - d) + t * (3 * (b - c) + d - a))))
+            x = 0.5 * (
+                2 * b
+                + t * ((c - a) + t * ((2 * a - 5 * b + 4 * c - d) + t * (3 * (b - c) + d - a)))
+            )
             found.append((float(x[0]), float(x[1])))
     return found
 
@@ -167,7 +175,9 @@ def lathe(runs: Sequence[Run], n: int = 32) -> Mesh:
         area = cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
         faces = faces[(area * area).sum(axis=-1) > 1e-20]  # at the axis a quad is one triangle
         parts.append(
-            Mesh(positions, turned(slope).reshape(-1, 3), np.stack([u, v], -1).reshape(-1, 2), faces)
+            Mesh(
+                positions, turned(slope).reshape(-1, 3), np.stack([u, v], -1).reshape(-1, 2), faces
+            )
         )
     return join(parts)
 
@@ -180,8 +190,14 @@ def ply(mesh: Mesh) -> bytes:
     names = ("x", "y", "z", "nx", "ny", "nz", "u", "v")
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
     header += [f"property float {name}" for name in names]
-    header += [f"element face {len(faces)}", "property list uchar uint vertex_indices", "end_header"]
-    return "".join(line + "\n" for line in header).encode("ascii") + rows.tobytes() + faces.tobytes()
+    header += [
+        f"element face {len(faces)}",
+        "property list uchar uint vertex_indices",
+        "end_header",
+    ]
+    return (
+        "".join(line + "\n" for line in header).encode("ascii") + rows.tobytes() + faces.tobytes()
+    )
 
 
 def png(pixels: NDArray[np.uint8]) -> bytes:
@@ -201,7 +217,9 @@ def png(pixels: NDArray[np.uint8]) -> bytes:
         (b"IDAT", data),
         (b"IEND", b""),
     ):
-        found += struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
+        found += (
+            struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
+        )
     return found
 
 
@@ -227,7 +245,9 @@ def main() -> None:
     here = Path(__file__).resolve().parent
     known = sorted(path.parent.name for path in here.glob("*/model.py"))
     parser = argparse.ArgumentParser(description="Write the meshes and textures of scenes.")
-    parser.add_argument("scenes", nargs="*", metavar="SCENE", help=f"of {', '.join(known)}; all by default")
+    parser.add_argument(
+        "scenes", nargs="*", metavar="SCENE", help=f"of {', '.join(known)}; all by default"
+    )
     names = parser.parse_args().scenes or known
     for name in names:
         if name not in known:

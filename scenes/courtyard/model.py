@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 from modelling import Mesh, beam, box, circle, curve, join, lathe, ply, quad
 
 BAYS, WIDTH = 5, 2.0
@@ -22,9 +24,11 @@ def arcade() -> Mesh:
     line.append((half, SPRING))
     front, back = half - THICK / 2, half + THICK / 2
     parts = []
-    for (x0, y0), (x1, y1) in zip(line[:-1], line[1:], strict=True):
+    for (x0, y0), (x1, y1) in pairwise(line):
         # Mitred at the corners of the court, where the next side begins.
-        (a, b), (c, d) = ((x - m, x + m) for x in (x0, x1) for m in [THICK / 2 * (x / half) * (abs(x) == half)])
+        (a, b), (c, d) = (
+            (x - m, x + m) for x in (x0, x1) for m in [THICK / 2 * (x / half) * (abs(x) == half)]
+        )
         if x1 - x0 > 1e-9:
             parts += [
                 quad((c, y1, front), (a, y0, front), (a, TOP, front), (c, TOP, front)),
@@ -36,7 +40,9 @@ def arcade() -> Mesh:
         [
             lathe(
                 [
-                    curve([(0.21, 0.1), (0.225, 0.13), (0.21, 0.16), (0.175, 0.18), (0.16, 0.22)], 2),
+                    curve(
+                        [(0.21, 0.1), (0.225, 0.13), (0.21, 0.16), (0.175, 0.18), (0.16, 0.22)], 2
+                    ),
                     curve(shaft, 1),
                     curve([(0.135, 1.86), (0.165, 1.875), (0.165, 1.9), (0.14, 1.91)], 1),
                     curve([(0.14, 1.91), (0.16, 1.97), (0.23, 2.02)], 3),
@@ -59,7 +65,12 @@ def roof() -> Mesh:
         a, b = (-inner, low + y, inner), (inner, low + y, inner)
         c, d = (outer, high + y, outer), (-outer, high + y, outer)
         parts.append(quad(b, a, d, c) if y == 0 else quad(a, b, c, d))
-    eave = quad((-inner, low, inner), (inner, low, inner), (inner, low + 0.14, inner), (-inner, low + 0.14, inner))
+    eave = quad(
+        (-inner, low, inner),
+        (inner, low, inner),
+        (inner, low + 0.14, inner),
+        (-inner, low + 0.14, inner),
+    )
     side = join([*parts, eave])
     return join([side.moved(ahead=ahead) for ahead in SIDES])
 
@@ -90,7 +101,12 @@ def walls() -> Mesh:
 
 def fountain() -> Mesh:
     """An eight-sided basin, a stem, a bowl."""
-    basin = [[(1.5, 0.0), (1.5, 0.5)], [(1.5, 0.5), (1.3, 0.5)], [(1.3, 0.5), (1.3, 0.12)], [(1.3, 0.12), (0.0, 0.12)]]
+    basin = [
+        [(1.5, 0.0), (1.5, 0.5)],
+        [(1.5, 0.5), (1.3, 0.5)],
+        [(1.3, 0.5), (1.3, 0.12)],
+        [(1.3, 0.12), (0.0, 0.12)],
+    ]
     stem = curve([(0.3, 0.12), (0.17, 0.4), (0.13, 0.8), (0.2, 1.0), (0.75, 1.22)], 5)
     bowl = curve([(0.72, 1.22), (0.4, 1.1), (0.0, 1.06)], 5)
     return join([lathe(basin, 8), lathe([stem, [(0.75, 1.22), (0.72, 1.22)], bowl], 32)])
@@ -101,7 +117,13 @@ def urns() -> Mesh:
     body = [(0.16, 0.0), (0.27, 0.25), (0.31, 0.5), (0.22, 0.78), (0.15, 0.86), (0.2, 0.94)]
     inside = [(0.18, 0.94), (0.13, 0.86), (0.19, 0.76), (0.0, 0.6)]
     jar = lathe([curve(body, 4), [(0.2, 0.94), (0.18, 0.94)], curve(inside, 2)], 16)
-    places = [(-7.45, 4.1, 1.0), (-7.5, 3.35, 0.72), (-7.4, -0.4, 1.15), (-7.5, -4.6, 0.9), (4.0, -7.4, 1.1)]
+    places = [
+        (-7.45, 4.1, 1.0),
+        (-7.5, 3.35, 0.72),
+        (-7.4, -0.4, 1.15),
+        (-7.5, -4.6, 0.9),
+        (4.0, -7.4, 1.1),
+    ]
     return join([jar.moved((x, 0, z), size=size) for x, z, size in places])
 
 
@@ -123,5 +145,3 @@ def files() -> dict[str, bytes]:
     meshes = {"arcade": arcade(), "roof": roof(), "beams": beams(), "walls": walls()}
     meshes |= {"fountain": fountain(), "urns": urns(), "bench": bench()}
     return {f"meshes/{name}.ply": ply(mesh) for name, mesh in meshes.items()}
-
-

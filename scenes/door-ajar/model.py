@@ -71,9 +71,7 @@ def door() -> Mesh:
 def table() -> Mesh:
     """A low table, askew, and a picture frame that leans on the left wall."""
     ahead, x, z = (0.35, 0.0, 1.0), -1.05, -0.75
-    legs = [
-        box((0.06, 0.68, 0.06)).moved((dx, 0, dz)) for dx in (-0.6, 0.6) for dz in (-0.3, 0.3)
-    ]
+    legs = [box((0.06, 0.68, 0.06)).moved((dx, 0, dz)) for dx in (-0.6, 0.6) for dz in (-0.3, 0.3)]
     top = box((1.35, 0.05, 0.75)).moved((0, 0.68, 0))
     bars = [beam((-0.6, 0.2, dz), (0.6, 0.2, dz), (0.04, 0.05)) for dz in (-0.3, 0.3)]
     return join([join([top, *legs, *bars]).moved((x, 0, z), ahead=ahead)])
@@ -92,21 +90,30 @@ def books(which: int) -> Mesh:
 
 def jug() -> Mesh:
     """A jug of copper on the table."""
-    outside = curve([(0.09, 0.0), (0.15, 0.09), (0.14, 0.2), (0.075, 0.3), (0.07, 0.36), (0.1, 0.42)], 6)
+    outside = curve(
+        [(0.09, 0.0), (0.15, 0.09), (0.14, 0.2), (0.075, 0.3), (0.07, 0.36), (0.1, 0.42)], 6
+    )
     inside = curve([(0.095, 0.42), (0.064, 0.36), (0.07, 0.3), (0.12, 0.2), (0.0, 0.05)], 4)
     return lathe([outside, [(0.1, 0.42), (0.095, 0.42)], inside]).moved((-1.25, 0.73, -0.72))
 
 
 def vase() -> Mesh:
     """A tall glazed vase on the floor."""
-    outside = curve([(0.11, 0.0), (0.2, 0.25), (0.18, 0.5), (0.09, 0.72), (0.08, 0.8), (0.13, 0.88)], 6)
+    outside = curve(
+        [(0.11, 0.0), (0.2, 0.25), (0.18, 0.5), (0.09, 0.72), (0.08, 0.8), (0.13, 0.88)], 6
+    )
     inside = curve([(0.12, 0.88), (0.07, 0.8), (0.08, 0.7), (0.0, 0.5)], 4)
     return lathe([outside, [(0.13, 0.88), (0.12, 0.88)], inside]).moved((0.08, 0, -1.5))
 
 
 def files() -> dict[str, bytes]:
     """The meshes by path."""
-    meshes = {"shell": shell(), "bright-shell": bright_shell(), "ceilings": ceilings(), "frame": frame()}
+    meshes = {
+        "shell": shell(),
+        "bright-shell": bright_shell(),
+        "ceilings": ceilings(),
+        "frame": frame(),
+    }
     meshes |= {"door": door(), "table": table(), "jug": jug(), "vase": vase()}
     meshes |= {"red-books": books(0), "blue-books": books(1)}
     return {f"meshes/{name}.ply": ply(mesh) for name, mesh in meshes.items()}

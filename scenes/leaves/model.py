@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
-
 from modelling import F64, Mesh, box, circle, cross, fraction, join, pfm, ply, png, quad, unit
+from numpy.typing import NDArray
 
 TWIGS, PER_TWIG = 160, 9
 SHAPE = (96, 64)
@@ -15,8 +14,22 @@ SUN = (0.55, 0.7, 0.25)
 """Towards the soft sun, in the environment's own axes."""
 
 LIMBS: list[tuple[list[tuple[float, float, float]], float, float]] = [
-    ([(0.0, -0.05, 0.0), (0.06, 0.5, 0.02), (-0.03, 1.0, 0.0), (0.05, 1.5, -0.04), (0.0, 2.1, 0.02)], 0.15, 0.05),
-    ([(-0.02, 0.95, 0.0), (-0.35, 1.35, 0.12), (-0.7, 1.65, 0.3), (-1.05, 1.85, 0.35)], 0.075, 0.02),
+    (
+        [
+            (0.0, -0.05, 0.0),
+            (0.06, 0.5, 0.02),
+            (-0.03, 1.0, 0.0),
+            (0.05, 1.5, -0.04),
+            (0.0, 2.1, 0.02),
+        ],
+        0.15,
+        0.05,
+    ),
+    (
+        [(-0.02, 0.95, 0.0), (-0.35, 1.35, 0.12), (-0.7, 1.65, 0.3), (-1.05, 1.85, 0.35)],
+        0.075,
+        0.02,
+    ),
     ([(0.03, 1.2, -0.02), (0.4, 1.55, 0.15), (0.75, 1.75, 0.3), (1.1, 1.8, 0.5)], 0.07, 0.02),
     ([(0.05, 1.5, -0.04), (0.2, 1.85, -0.4), (0.45, 2.2, -0.7)], 0.06, 0.02),
     ([(0.04, 1.55, -0.03), (-0.25, 2.0, -0.3), (-0.6, 2.4, -0.5)], 0.06, 0.02),
@@ -39,16 +52,23 @@ def limb(axis: list[tuple[float, float, float]], root: float, tip: float) -> Mes
     positions = p[:, None] + radius * normals
     index = np.arange(len(p) * 17).reshape(len(p), 17)
     a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
-    faces = np.stack([np.stack([a, b, c], -1), np.stack([a, c, d], -1)], axis=2).reshape(-1, 3)
+    faces = np.stack([np.stack([a, c, b], -1), np.stack([a, d, c], -1)], axis=2).reshape(-1, 3)
     u, v = np.meshgrid(np.arange(17) / 16, np.arange(len(p)) / (len(p) - 1))
-    return Mesh(positions.reshape(-1, 3), normals.reshape(-1, 3), np.stack([u, v], -1).reshape(-1, 2), faces)
+    return Mesh(
+        positions.reshape(-1, 3), normals.reshape(-1, 3), np.stack([u, v], -1).reshape(-1, 2), faces
+    )
 
 
 def _direction(i: int) -> F64:
     """Direction i of a sequence that covers the sphere, by throwing out what is not in the unit ball."""
     k = 37 * i
     while True:
-        v = np.array([2 * fraction(k, step) - 1 for step in (0.8191725133961645, 0.671043606703789, 0.549700477901970)])
+        v = np.array(
+            [
+                2 * fraction(k, step) - 1
+                for step in (0.8191725133961645, 0.671043606703789, 0.549700477901970)
+            ]
+        )
         k += 1
         if 0.01 < v[0] * v[0] + v[1] * v[1] + v[2] * v[2] < 1:
             return unit(v)
@@ -88,7 +108,9 @@ def fallen() -> Mesh:
         x, z = 3.6 * fraction(i, 0.7548776662466927) - 1.8, 3.4 * fraction(i, 0.569840290998) - 1.2
         d = _direction(9000 + i)
         along = unit(np.array([d[0], 0.15 + 0.1 * d[1], d[2]]))
-        leaves.append(leaf(np.array([x, 0.012, z]), along, np.array([0.2 * d[2], 1.0, -0.2 * d[0]]), 0.16))
+        leaves.append(
+            leaf(np.array([x, 0.012, z]), along, np.array([0.2 * d[2], 1.0, -0.2 * d[0]]), 0.16)
+        )
     return join(leaves)
 
 
@@ -136,7 +158,9 @@ def colours() -> NDArray[np.uint8]:
     light = np.maximum(rib, 0.6 * vein)[..., None]
     rim = (u * u * (0.4 + 0 * v))[..., None]
     base = np.array([70.0, 122.0, 38.0]) * (1 - rim) + np.array([150.0, 140.0, 40.0]) * rim
-    return np.floor(base * (1 - 0.5 * light) + np.array([175.0, 195.0, 110.0]) * 0.5 * light + 0.5).astype(np.uint8)
+    return np.floor(
+        base * (1 - 0.5 * light) + np.array([175.0, 195.0, 110.0]) * 0.5 * light + 0.5
+    ).astype(np.uint8)
 
 
 def sky() -> F64:
@@ -151,10 +175,12 @@ def sky() -> F64:
     away = (x - sun[0]) * (x - sun[0]) + (y - sun[1]) * (y - sun[1]) + (z - sun[2]) * (z - sun[2])
     glow = 1 / (1 + away / 0.02)
     glow = (glow * glow)[..., None]
-    blue = np.array([0.2, 0.33, 0.6]) + (np.array([0.6, 0.64, 0.68]) - [0.2, 0.33, 0.6]) * (1 - np.abs(y))[..., None]
+    blue = (
+        np.array([0.2, 0.33, 0.6])
+        + (np.array([0.6, 0.64, 0.68]) - [0.2, 0.33, 0.6]) * (1 - np.abs(y))[..., None]
+    )
     above = blue + glow * np.array([140.0, 118.0, 84.0])
-    found = np.where((y > 0)[..., None], above, np.array([0.09, 0.08, 0.06]))
-    return found
+    return np.where((y > 0)[..., None], above, np.array([0.09, 0.08, 0.06]))
 
 
 def files() -> dict[str, bytes]:

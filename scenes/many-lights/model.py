@@ -9,7 +9,14 @@ SIDE, CELL, HIGH = 6, 2.6, 1.75
 """Cells a side, the side of a cell and the height of a partition."""
 LAMP, LAMP_SPOT = 1.2, (0.38, -0.1)
 """Height of a lamp, well below the partitions' tops, and where it hangs over the desk."""
-COLOURS = [(1.0, 0.78, 0.5), (1.0, 0.86, 0.68), (0.75, 0.88, 1.0), (1.0, 0.7, 0.4), (0.9, 1.0, 0.9), (1.0, 0.62, 0.55)]
+COLOURS = [
+    (1.0, 0.78, 0.5),
+    (1.0, 0.86, 0.68),
+    (0.75, 0.88, 1.0),
+    (1.0, 0.7, 0.4),
+    (0.9, 1.0, 0.9),
+    (1.0, 0.62, 0.55),
+]
 
 
 def cells() -> list[tuple[int, float, float, tuple[float, float, float]]]:
@@ -30,7 +37,9 @@ def partitions(accent: bool) -> Mesh:
             painted = (row * 5 + column * 3) % 7 == 0
             high = HIGH if row < SIDE else 0.5  # low in front, so that the first row is seen
             if painted == accent:
-                parts.append(box((CELL, high, 0.06), ((column + 0.5) * CELL - half, 0, row * CELL - half)))
+                parts.append(
+                    box((CELL, high, 0.06), ((column + 0.5) * CELL - half, 0, row * CELL - half))
+                )
     for column in range(SIDE + 1):
         for row in range(SIDE):
             depth = CELL if column in (0, SIDE) else 0.68 * CELL
@@ -71,13 +80,14 @@ def shade() -> Mesh:
 
 def pot() -> Mesh:
     """A plant's pot."""
-    return lathe([curve([(0.13, 0.0), (0.18, 0.2), (0.2, 0.36)], 3), [(0.2, 0.36), (0.0, 0.34)]], 16)
+    return lathe(
+        [curve([(0.13, 0.0), (0.18, 0.2), (0.2, 0.36)], 3), [(0.2, 0.36), (0.0, 0.34)]], 16
+    )
 
 
 def plant() -> Mesh:
     """Leaves of a plant, as a few bent blades."""
-    blade = lathe([curve([(0.0, 0.34), (0.16, 0.6), (0.19, 0.8), (0.1, 1.0), (0.0, 1.1)], 3)], 8)
-    return blade
+    return lathe([curve([(0.0, 0.34), (0.16, 0.6), (0.19, 0.8), (0.1, 1.0), (0.0, 1.1)], 3)], 8)
 
 
 def spot(
@@ -100,7 +110,7 @@ def placed(part: Mesh, dx: float, dz: float, *, every: int = 1, first: int = 0) 
 
 def lamps() -> str:
     """The lamps as Mitsuba's XML: disks that face down inside their shades."""
-    found = ["<scene version=\"3.0.0\">\n    <!-- Written by model.py. -->\n"]
+    found = ['<scene version="3.0.0">\n    <!-- Written by model.py. -->\n']
     for i, x, z, ahead in cells():
         (px, pz) = spot(x, z, ahead, *LAMP_SPOT)
         power = 60 + 50 * fraction(i, 0.7548776662466927)
