@@ -39,6 +39,8 @@ def _render(scene: mi.Scene, *, max_depth: int, spp: int) -> NDArray[np.float32]
 
 
 tess = _load_script(TEAPOT / "tessellate.py")
+modelling = _load_script(ROOT / "scenes" / "modelling.py")
+MODELLED = [folder for folder in SHIPPED if (folder / "model.py").exists()]
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +51,8 @@ def teapot() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64
 
 
 def test_there_are_shipped_scenes() -> None:
-    assert {"cornell-box", "teapot"} <= {path.name for path in SHIPPED}
+    hard = {"courtyard", "door-ajar", "glossy", "leaves", "many-lights"}
+    assert {"cornell-box", "teapot", "white-room"} | hard <= {path.name for path in SHIPPED}
 
 
 @pytest.mark.parametrize("folder", SHIPPED, ids=lambda path: path.name)
@@ -81,6 +84,75 @@ def test_small_scene_loads_in_tiles_and_is_lit(name: str, variant: str) -> None:
     assert (width % 16, height % 16) == (0, 0)
     assert np.isfinite(image).all()
     assert image.mean() > 0.01
+
+
+@pytest.mark.parametrize("folder", MODELLED, ids=lambda path: path.name)
+def test_shipped_files_are_what_the_script_writes(folder: Path) -> None:
+    """Bit for bit, nothing else lies beside them, and a scene's folder stays below a megabyte."""
+    expected = modelling.outputs(folder)
+    own = {"README.md", "model.py", "scene.xml"}
+    files = {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
+    assert set(files) == own | set(expected)
+    assert sum(map(len, files.values())) < 1_000_000
+    for name, content in expected.items():
+        assert files[name] == content, (
+            f"{folder.name}/{name} differs from the script's; run python scenes/modelling.py {folder.name}"
+        )
+
+
+@pytest.mark.parametrize("folder", MODELLED, ids=lambda path: path.name)
+def test_modelled_meshes_have_unit_normals_on_their_own_side(
+    folder: Path, scalar_variant: str
+) -> None:
+    meshes = sorted((folder / "meshes").glob("*.ply"))
+    assert meshes
+    for path in meshes:
+        params = mi.traverse(mi.load_dict({"type": "ply", "filename": str(path)}))
+        positions = np.array(params["vertex_positions"], float).reshape(-1, 3)
+        normals = np.array(params["vertex_normals"], float).reshape(-1, 3)
+        corners = positions[np.array(params["faces"], int).reshape(-1, 3)]
+        np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-5)
+        flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        area = np.linalg.norm(flat, axis=1)
+        assert area.min() > 1e-9, f"{path.name} has a degenerate triangle"
+        faces = np.array(params["faces"], int).reshape(-1, 3)
+        mean = normals[faces].sum(axis=1)
+        assert ((flat * mean).sum(axis=-1) > 0).mean() > 0.99, path.name
+
+
+@pytest.mark.parametrize("n", [0, 3, 12])
+def test_a_circle_is_halved_quarters(n: int) -> None:
+    with pytest.raises(ValueError, match=f"n = {n} points of a circle"):
+        modelling.circle(n)
+
+
+def test_stored_images_are_read_back(tmp_path: Path, scalar_variant: str) -> None:
+    """More than one stored block; rows top to bottom; the channels in their order."""
+    pixels = (np.arange(180 * 150 * 3) * 7 % 251).astype(np.uint8).reshape(180, 150, 3)
+    for name, wanted in (("grey", pixels[..., 0]), ("rgb", pixels)):
+        (tmp_path / f"{name}.png").write_bytes(modelling.png(wanted))
+        read = np.array(mi.Bitmap(str(tmp_path / f"{name}.png")))
+        np.testing.assert_array_equal(read.reshape(wanted.shape), wanted)
+    (tmp_path / "sky.pfm").write_bytes(modelling.pfm(pixels / 8.0))
+    np.testing.assert_array_equal(np.array(mi.Bitmap(str(tmp_path / "sky.pfm"))), pixels / 8.0)
+
+
+def test_many_lights_are_many_and_each_keeps_to_its_cell(scalar_variant: str) -> None:
+    """36 emitters, one-sided, facing down from below the partitions' tops."""
+    scene = mi.load_file(str(ROOT / "scenes" / "many-lights" / "scene.xml"))
+    assert len(scene.emitters()) == 36
+    places = set()
+    for lamp in scene.emitters():
+        sample = lamp.get_shape().sample_position(0.0, [0.3, 0.7])
+        np.testing.assert_allclose(np.array(sample.n), [0, -1, 0], atol=1e-6)
+        x, y, z = np.array(sample.p)
+        assert y < 1.75
+        places.add((int((x + 7.8) // 2.6), int((z + 7.8) // 2.6)))
+    assert len(places) == 36, "no two lamps in one cell"
 
 
 def test_cornell_box_has_the_published_proportions(scalar_variant: str) -> None:
