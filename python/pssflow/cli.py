@@ -81,6 +81,11 @@ def _scene_options(command: F) -> F:
                 "--sensor", type=click.IntRange(0), default=0, show_default=True, help="Its index."
             ),
             click.option(
+                "--approximate",
+                is_flag=True,
+                help="Replace what is not supported, and say what by.",
+            ),
+            click.option(
                 "--variant",
                 help="Mitsuba variant.  [default: llvm_ad_rgb, or scalar_rgb without LLVM]",
             ),
@@ -378,6 +383,7 @@ def _load(terminal: Terminal, options: Mapping[str, Any]) -> Any:
         options["sensor"],
         size=options["size"],
         scale=options["scale"],
+        approximate=options["approximate"],
         **dict(options["parameters"]),
     )
 

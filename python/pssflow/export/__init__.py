@@ -105,12 +105,21 @@ class Inspection:
     """As in `Export`."""
 
 
-def export(scene: Any, sensor: Any = 0) -> Export:
+def export(
+    scene: Any,
+    sensor: Any = 0,
+    *,
+    hide_emitters: bool | None = None,
+    approximate: bool = False,
+) -> Export:
     """Exports a scene in its current state.
 
     Args:
         scene: an `mi.Scene` of one of `VARIANTS`, which must be the active one.
         sensor: index of one of its sensors, or a sensor object.
+        hide_emitters: whether camera rays pass through the surfaces of emitters; None for what the scene's integrator
+            says, as it would render it.
+        approximate: whether what is not supported is replaced where there is a replacement; a note names each.
 
     Raises:
         UnsupportedError: the scene holds what cannot be rendered. All of it was looked for; the first few are named.
@@ -118,7 +127,7 @@ def export(scene: Any, sensor: Any = 0) -> Export:
         TypeError: `scene` is no scene.
     """
     start = time.perf_counter()
-    walk, shapes, emitters, (camera, film) = _walk(scene, sensor)
+    walk, shapes, emitters, (camera, film) = _walk(scene, sensor, approximate=approximate)
     if walk.unsupported:
         raise UnsupportedError(_explain(walk.unsupported))
     description = {
@@ -131,6 +140,7 @@ def export(scene: Any, sensor: Any = 0) -> Export:
         "emitters": walk.entries["emitter"],
         "sensor": camera,
         "film": film,
+        "hide_emitters": hides_emitters(scene) if hide_emitters is None else bool(hide_emitters),
     }
     return Export(
         description=description,
@@ -142,14 +152,19 @@ def export(scene: Any, sensor: Any = 0) -> Export:
     )
 
 
-def inspect_scene(scene: Any, sensor: Any = 0) -> Inspection:
+def hides_emitters(scene: Any) -> bool:
+    """Whether the scene's integrator hides the surfaces of emitters from the camera; by default Mitsuba shows them."""
+    return bool(getattr(scene.integrator(), "hide_emitters", False))
+
+
+def inspect_scene(scene: Any, sensor: Any = 0, *, approximate: bool = False) -> Inspection:
     """Goes through a scene as `export` does, but reports what is unsupported instead of raising.
 
     Raises:
         UnsupportedError: the scene's variant is not supported.
         ValueError, TypeError: as in `export`.
     """
-    walk, *_ = _walk(scene, sensor)
+    walk, *_ = _walk(scene, sensor, approximate=approximate)
     shapes = walk.entries["shape"] + [
         shape for group in walk.entries["group"] for shape in group["shapes"]
     ]
@@ -178,14 +193,15 @@ def stable_emitter_order(scene: Any) -> list[int]:
 
 
 def _walk(
-    scene: Any, sensor: Any
+    scene: Any, sensor: Any, *, approximate: bool
 ) -> tuple[Walk, list[Any], list[Any], tuple[Entry | None, Entry | None]]:
     """Visits everything once; returns the walk, shapes and emitters in the description's order, and sensor and film."""
     _check_scene(scene)
     camera = select_sensor(scene, sensor)
     # Mitsuba calls children without an id `object_<address>`: no name for a second process.
     children = Fields(scene).children.items()
-    walk = Walk({child: name for name, child in children if not name.startswith("object_")})
+    names = {child: name for name, child in children if not name.startswith("object_")}
+    walk = Walk(names, approximate=approximate)
     walk.groups = {
         child.id(): child for _, child in children if class_of(child) == "ShapeGroupPlugin"
     }
@@ -207,11 +223,6 @@ def _walk(
     suns = [emitter for _, emitter, _ in emitters if class_of(emitter) == "SunskyEmitter"]
     emitters += [("", sun, None) for sun in suns[: len(walk.entries["sun"])]]
     entries = export_sensor(walk, camera)
-    hides = getattr(scene.integrator(), "hide_emitters", False)
-    if hides and walk.counts["emitter"]["area"]:
-        walk.notes.append(
-            "`hide_emitters` is ignored: the camera sees the surfaces of lights, not what lies behind them"
-        )
     return walk, [shape for _, shape in shapes], [emitter for _, emitter, _ in emitters], entries
 
 
@@ -250,7 +261,10 @@ def _explain(unsupported: list[Unsupported]) -> str:
     kinds = [kind for kind in unknown if kind in SUPPORTED]
     supported = "; ".join(f"{kind}s: {', '.join(SUPPORTED[kind])}" for kind in kinds)
     hint = f" (supported {supported})" if supported else ""
-    return f"{named}{counted}{hint}. Replace them in the scene, or render this scene with Mitsuba's `path`"
+    remedy = "Replace them in the scene, "
+    if all(thing.instead is not None for thing in unsupported):
+        remedy += "let `--approximate` (in Python `approximate=True`) replace them, "
+    return f"{named}{counted}{hint}. {remedy}or render this scene with Mitsuba's `path`"
 
 
 def _positions(objects: list[Any], ordered: list[Any]) -> list[int]:

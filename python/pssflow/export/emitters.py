@@ -77,6 +77,10 @@ def _area(walk: Walk, obj: Any, where: str, shape: Any, index: int | None) -> En
     if shape is None or index is None:
         raise RefusedError("has no shape")
     radiance = Fields(obj)["radiance"]
+    if class_of(radiance) == "MeshAttribute":
+        raise RefusedError(
+            "has a `mesh_attribute` as `radiance`, which Mitsuba itself samples as black; use a bitmap"
+        )
     # Mitsuba finds the place of a texel on the shape through uv, and throws here without them.
     if radiance.is_spatially_varying() and shape.is_mesh() and not shape.has_vertex_texcoords():
         raise RefusedError("has a textured `radiance` on a mesh without texture coordinates")

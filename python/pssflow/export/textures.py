@@ -1,4 +1,4 @@
-"""Textures and spectra: constants and bitmaps.
+"""Textures and spectra: constants, bitmaps, boards, and attributes of meshes.
 
 In the RGB variants Mitsuba turns the emission spectra of a scene file into these before we see them: `d65` becomes
 `uniform`, `srgb` or the bitmap that it nests.
@@ -93,9 +93,14 @@ def _checkerboard(walk: Walk, obj: Any, where: str) -> Entry:
     return entry
 
 
+def _mesh_attribute(_walk: Walk, obj: Any, _where: str) -> Entry:
+    return {"name": printed(obj).get("name", "").strip('"'), "scale": number(Fields(obj)["scale"], "scale")}
+
+
 TEXTURES: dict[str, Converter] = {
     "Checkerboard": Converter("checkerboard", "checkerboard", _checkerboard),
     "SRGBReflectanceSpectrum": Converter("srgb", "constant", _constant),
+    "MeshAttribute": Converter("mesh_attribute", "mesh_attribute", _mesh_attribute),
     "UniformSpectrum": Converter("uniform", "constant", _constant),
     "RawConstantTexture": Converter("rawconstant", "constant", _constant),
     "BitmapTextureImpl": Converter("bitmap", "bitmap", _bitmap),

@@ -247,6 +247,8 @@ function_table! {
     commit_geometry = "rtcCommitGeometry": fn(RtcGeometry);
     set_new_geometry_buffer = "rtcSetNewGeometryBuffer":
         fn(RtcGeometry, c_uint, c_uint, c_uint, usize, usize) -> *mut c_void;
+    set_shared_geometry_buffer = "rtcSetSharedGeometryBuffer":
+        fn(RtcGeometry, c_uint, c_uint, c_uint, *const c_void, usize, usize, usize);
     set_geometry_user_primitive_count = "rtcSetGeometryUserPrimitiveCount": fn(RtcGeometry, c_uint);
     set_geometry_user_data = "rtcSetGeometryUserData": fn(RtcGeometry, *mut c_void);
     set_geometry_bounds_function = "rtcSetGeometryBoundsFunction":

@@ -29,10 +29,13 @@ pub(crate) fn any(array: &Bound<'_, PyAny>, index: usize) -> PyResult<Array> {
 }
 
 fn elements<T: numpy::Element + Copy>(a: &PyReadonlyArrayDyn<'_, T>) -> Vec<T> {
+    // Room for what Embree wants behind an array that it reads in place.
+    let mut owned = Vec::with_capacity(a.len() + 4);
     match a.as_slice() {
-        Ok(slice) => slice.to_vec(),
-        Err(_) => a.as_array().iter().copied().collect(),
+        Ok(slice) => owned.extend_from_slice(slice),
+        Err(_) => owned.extend(a.as_array().iter().copied()),
     }
+    owned
 }
 
 /// Rows of a matrix and their length.

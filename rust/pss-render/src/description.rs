@@ -33,6 +33,9 @@ pub(crate) struct SceneDescription {
     pub(crate) emitters: Vec<emitter::Description>,
     pub(crate) sensor: sensor::Description,
     pub(crate) film: film::Description,
+    /// Camera rays pass through the surfaces of emitters, as with Mitsuba's option of that name.
+    #[serde(default)]
+    pub(crate) hide_emitters: bool,
 }
 
 /// Shapes in a space of their own.

@@ -3,7 +3,7 @@
 use glam::Vec2;
 use serde::Deserialize;
 
-use super::TextureModel;
+use super::{TextureModel, TexturePoint};
 use crate::arrays::{ArrayRef, Arrays, check_all_finite, check_finite};
 use crate::error::SceneError;
 use crate::math::{Rgb, luminance};
@@ -118,7 +118,8 @@ fn to_index(x: f32) -> i32 {
 }
 
 impl TextureModel for Bitmap {
-    fn eval(&self, uv: Vec2) -> Rgb {
+    fn eval(&self, at: TexturePoint<'_>) -> Rgb {
+        let uv = at.uv;
         let [a, b] = self.to_uv;
         let x = (a[0] * uv.x + a[1] * uv.y + a[2]) * self.width as f32;
         let y = (b[0] * uv.x + b[1] * uv.y + b[2]) * self.height as f32;
@@ -160,8 +161,8 @@ impl TextureModel for Bitmap {
         size * Vec2::new(a[0] * dx + b[0] * dy, a[1] * dx + b[1] * dy)
     }
 
-    fn eval_scalar(&self, uv: Vec2) -> f32 {
-        let value = self.eval(uv);
+    fn eval_scalar(&self, at: TexturePoint<'_>) -> f32 {
+        let value = self.eval(at);
         if self.channels == 1 { value.x } else { luminance(value) }
     }
 }
