@@ -154,9 +154,7 @@ class Scene:
     ) -> tuple[F32, tuple[F32, F32, F32, NDArray[np.bool_]]]:
         """Delta lobes alone, from one number each: their probability (n,), and what `bsdf_sample` returns."""
     def texture_eval(self, texture: int, uv: F32) -> F32: ...
-    def texture_eval_at_hits(
-        self, texture: int, origins: F32, directions: F32
-    ) -> tuple[F32, F32]:
+    def texture_eval_at_hits(self, texture: int, origins: F32, directions: F32) -> tuple[F32, F32]:
         """A texture's colours (n,3) and scalars (n,) where rays meet surfaces; zero where they meet none."""
     def emitter_eval_pdf(self, emitter: int, reference: F32, directions: F32) -> tuple[F32, F32]:
         """What rays see of an emitter, (n, 3), and its density in solid angle, (n,)."""

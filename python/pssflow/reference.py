@@ -287,7 +287,9 @@ class _Renderer:
         self.camera = select_sensor(scene, sensor)
         self.jit = not scene.variant_name().startswith("scalar")
         self.deep, self.shallow = (
-            mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": k + 2, "hide_emitters": hide})
+            mi.load_dict(
+                {"type": "path", "max_depth": depth, "rr_depth": k + 2, "hide_emitters": hide}
+            )
             for depth in (k + 1, k)
         )
         self.sample_count = self.camera.sampler().sample_count()

@@ -154,10 +154,10 @@ class Scene:
         size: width and height of the film in pixels in place of the scene's own. The horizontal field of view stays,
             the crop becomes the whole film. Changes the `mi.Scene`.
         scale: factor on the film's size in place of `size`; a crop is scaled with it.
-        hide_emitters: whether camera rays pass through the surfaces of emitters, as Mitsuba's option of that name. None:
-            what the scene's own integrator says.
-        approximate: whether what is not supported is replaced where there is a replacement (a BSDF by a diffuse one of
-            its mean reflectance, a texture by its mean; media and emitters are left out), with a note for each.
+        hide_emitters: whether camera rays pass through the surfaces of emitters, as Mitsuba's option of that name.
+            None: what the scene's own integrator says.
+        approximate: whether what is not supported is replaced where there is a replacement (a BSDF by a diffuse one
+            of its mean reflectance, a texture by its mean; media and emitters are left out), with a note for each.
         **xml_parameters: values for `$name` in the XML file.
 
     Raises:
@@ -317,7 +317,10 @@ class Scene:
         parametrisation: str = "bsdf",
         threads: int | None = None,
     ) -> tuple[str, str | None]:
-        """`mis` or `nee`, and for `auto` why it means that here; a probe of some 100 000 paths tells, the same always."""
+        """`mis` or `nee`, and for `auto` why it means that here.
+
+        A probe of some 100 000 paths tells, the same always; it is made once for each k and parametrisation.
+        """
         if emitter_strategy != "auto":
             return emitter_strategy, None
         key = (k, parametrisation)

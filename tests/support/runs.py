@@ -12,7 +12,10 @@ Runs = NDArray[np.float32]
 
 
 def mitsuba_runs(scene: mi.Scene, *, max_depth: int, seeds: Iterable[int], spp: int) -> Runs:
-    """Mitsuba's `path`, one image a seed, in the scene's own film; emitters hide where the scene's integrator hides them."""
+    """Mitsuba's `path`, one image a seed, in the scene's own film.
+
+    Emitters hide where the scene's integrator hides them.
+    """
     # Roulette would draw numbers and end paths that the difference of two depths needs.
     hide = bool(getattr(scene.integrator(), "hide_emitters", False))
     depths = {"max_depth": max_depth, "rr_depth": max_depth + 2}

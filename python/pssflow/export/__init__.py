@@ -24,6 +24,7 @@ import mitsuba as mi
 from numpy.typing import NDArray
 
 from .bsdfs import BSDFS
+from .describe import understood
 from .emitters import EMITTERS, ordered_emitters
 from .sensors import FILMS, SENSORS, export_sensor, select_sensor
 from .shapes import SHAPES, export_shape, ordered_shapes
@@ -74,7 +75,7 @@ class Export:
     description: Entry
     """The description, of numbers, strings, lists and dictionaries only. Arrays are named by their index."""
     arrays: list[NDArray[Any]]
-    """C-contiguous float32 or uint32. In LLVM variants they may share Mitsuba's memory: don't write to them."""
+    """C-contiguous float32, uint8 or uint32. In LLVM variants they may share Mitsuba's memory: don't write to them."""
     shape_order: list[int]
     """For each shape of the description its position in `scene.shapes()`, which differs between processes."""
     emitter_order: list[int]
@@ -99,6 +100,8 @@ class Inspection:
     """Of all supported meshes, two for each rectangle; those of groups once, however many instances show them."""
     array_bytes: int
     """Size of all arrays."""
+    bsdfs: list[dict[str, Any]]
+    """Every BSDF that a shape wears: `id`, `shapes` (how many wear it), `what` (in words)."""
     unsupported: list[Unsupported]
     """Everything that `export` would refuse; empty if the scene can be rendered."""
     notes: list[str]
@@ -174,6 +177,7 @@ def inspect_scene(scene: Any, sensor: Any = 0, *, approximate: bool = False) -> 
         counts={kind: dict(sorted(walk.counts[kind].items())) for kind in SUPPORTED},
         triangles=triangles + 2 * walk.counts["shape"]["rectangle"],
         array_bytes=sum(array.nbytes for array in walk.arrays),
+        bsdfs=understood(walk.entries, walk.arrays),
         unsupported=walk.unsupported,
         notes=walk.notes,
     )
@@ -206,6 +210,8 @@ def _walk(
         child.id(): child for _, child in children if class_of(child) == "ShapeGroupPlugin"
     }
 
+    walk.shutter = (float(camera.shutter_open()), float(camera.shutter_open_time()))
+
     shapes = ordered_shapes(scene.shapes())
     emitters = ordered_emitters(scene.emitters(), shapes)
     emitter_of = {shape: i for i, (_, _, shape) in enumerate(emitters) if shape is not None}
@@ -220,8 +226,7 @@ def _walk(
     walk.shape = None
     # Emitters that came out of another one: behind all others, whose indices stay.
     walk.entries["emitter"] += walk.entries["sun"]
-    suns = [emitter for _, emitter, _ in emitters if class_of(emitter) == "SunskyEmitter"]
-    emitters += [("", sun, None) for sun in suns[: len(walk.entries["sun"])]]
+    emitters += [("", sky, None) for sky in walk.suns]
     entries = export_sensor(walk, camera)
     return walk, [shape for _, shape in shapes], [emitter for _, emitter, _ in emitters], entries
 

@@ -84,7 +84,7 @@ def _constant(walk: Walk, where: str, rgb: list[float]) -> int:
 
 
 def mean_reflectance(bsdf: Any) -> list[float] | None:
-    """Share of light that comes back from a surface lit evenly from above, in RGB; None where Mitsuba gives no value."""
+    """Share of light that comes back from a surface lit evenly from above, RGB; None where Mitsuba gives no value."""
     rng = np.random.default_rng(0)
     n = _count()
     uv, u = rng.random((n, 2)), rng.random((n, 3))
@@ -114,7 +114,7 @@ def mean_reflectance(bsdf: Any) -> list[float] | None:
 def mean_of_texture(texture: Any) -> list[float] | None:
     """Its mean over uv in [0, 1)², in RGB; None where Mitsuba gives no value."""
     uv = np.random.default_rng(0).random((_count(), 2))
-    up = np.zeros((len(uv), 3)) + [0, 0, 1]
+    up = np.tile([0.0, 0.0, 1.0], (len(uv), 1))
     try:
         if _scalar():
             points = (_surface(uv[i], up[i]) for i in range(len(uv)))

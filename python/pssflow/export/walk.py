@@ -94,6 +94,10 @@ class Walk:
         """Shapegroups of the scene by name."""
         self.group_indices: dict[str, int] = {}
         """Index of each group that an instance showed so far."""
+        self.suns: list[Any] = []
+        """The sky that each entry of `entries["sun"]` came out of."""
+        self.shutter = (0.0, 0.0)
+        """When the sensor's shutter opens, and for how long."""
         self._names = names
         self._indices: dict[tuple[str, Hashable], int] = {}
         self._attributes: dict[Hashable, tuple[str, ...]] = {}
@@ -310,6 +314,11 @@ def printed(obj: Any) -> dict[str, str]:
                 pairs.setdefault(name.strip(), value.strip())
             start = i + 1
     return pairs
+
+
+def sampling_weight(obj: Any) -> float:
+    """An emitter's weight when one is chosen."""
+    return number(obj.sampling_weight(), "sampling_weight")
 
 
 SWITCH: Mapping[str, bool] = {"0": False, "1": True, "false": False, "true": True}

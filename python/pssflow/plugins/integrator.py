@@ -26,7 +26,8 @@ Learned light of exactly k bounces (:monosp:`pssflow`)
  * - approximate
    - |bool|
    - Whether what is not supported is replaced where there is a replacement: a BSDF by a diffuse one of its mean
-     reflectance, a texture by its mean; media and emitters are left out. ``result.notes`` names each. (Default: |false|)
+     reflectance, a texture by its mean; media and emitters are left out. ``result.notes`` names each.
+     (Default: |false|)
  * - parametrisation
    - |string|
    - ``bsdf``, ``cosine`` or ``uniform``: what a direction's two numbers mean. (Default: ``bsdf``)

@@ -35,6 +35,10 @@ pub struct Summary {
     pub geometry_bytes: usize,
     /// Number of textures.
     pub textures: usize,
+    /// Bytes of their values.
+    pub texture_bytes: usize,
+    /// Bytes that Embree allocated while the scene was built.
+    pub bvh_bytes: usize,
 }
 
 /// A scene that can be traced. Send + Sync; nothing in it changes after it is built.
@@ -53,6 +57,7 @@ pub struct Scene {
     sensor: Sensor,
     film: Film,
     hide_emitters: bool,
+    bvh_bytes: usize,
     hash: String,
 }
 
@@ -157,6 +162,7 @@ impl Scene {
             return Err(SceneError::Empty);
         }
         let (mut shapes, mut commons) = (Vec::new(), Vec::new());
+        let allocated = device.memory();
         let mut builder = embree4::SceneBuilder::new(device)?;
         let mut add = |description, emitters| {
             let (common, shape) = Shape::build(description, &mut arrays)?;
@@ -228,8 +234,10 @@ impl Scene {
         let attributes = shapes.iter().map(|s| s.model().attributes());
         materials.attributes = Attributes::new(attributes.collect());
         let film = Film::build(d.film)?;
+        let accel = builder.commit()?;
         Ok(Self {
-            accel: builder.commit()?,
+            accel,
+            bvh_bytes: device.memory().saturating_sub(allocated),
             shapes,
             commons,
             group_starts,
@@ -425,6 +433,8 @@ impl Scene {
             *s.emitters.entry(e.name().to_owned()).or_default() += 1;
         }
         s.textures = self.materials.textures.len();
+        s.texture_bytes = self.materials.textures.iter().map(Texture::memory).sum();
+        s.bvh_bytes = self.bvh_bytes;
         s
     }
 }

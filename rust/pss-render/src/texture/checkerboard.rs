@@ -50,6 +50,10 @@ impl Checkerboard {
 }
 
 impl TextureModel for Checkerboard {
+    fn memory(&self) -> usize {
+        self.colors.iter().map(|c| c.memory()).sum()
+    }
+
     fn eval(&self, at: TexturePoint<'_>) -> Rgb {
         self.colors[usize::from(!self.first(at.uv))].eval(at)
     }

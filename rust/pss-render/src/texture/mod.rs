@@ -33,6 +33,10 @@ pub(crate) trait TextureModel {
     fn eval(&self, at: TexturePoint<'_>) -> Rgb;
     /// The scalar: Mitsuba's `eval_1`.
     fn eval_scalar(&self, at: TexturePoint<'_>) -> f32;
+    /// Bytes of its values.
+    fn memory(&self) -> usize {
+        0
+    }
     /// The scalar's gradient over uv: Mitsuba's `eval_1_grad`.
     fn gradient(&self, _uv: Vec2) -> Vec2 {
         Vec2::ZERO
@@ -73,6 +77,11 @@ macro_rules! registry {
             #[inline]
             pub fn eval_scalar(&self, at: TexturePoint<'_>) -> f32 {
                 match self { $(Self::$variant(t) => t.eval_scalar(at),)* }
+            }
+
+            /// Bytes of its values.
+            pub fn memory(&self) -> usize {
+                match self { $(Self::$variant(t) => t.memory(),)* }
             }
 
             /// The scalar's gradient over uv (Mitsuba's `eval_1_grad`); zero where it has none.
