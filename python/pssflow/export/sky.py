@@ -42,7 +42,10 @@ SKY_WIDTH, SKY_HEIGHT = 512, 201
 SUN_RINGS = 17
 """Values of a sun's radiance between its centre and its rim, where it is not the same all over."""
 
-SKY_TIMES = 1024
+SUN_TURNS = 16
+"""Places around each ring."""
+
+SKY_TIMES = 256
 """Moments that a sky is averaged over, evenly spaced in the shutter's opening."""
 
 SUN_TIMES, SUN_POINTS = 16384, 64
@@ -229,13 +232,17 @@ def _half_angle(obj: Any) -> float:
 def _sun(half_angle: float, excess: Radiance, direction: F64, up: F64) -> Entry:
     """A sun that stands still: its size, and its radiance from the centre to the rim."""
     axis = direction / np.linalg.norm(direction)
-    # Away from the horizon, so that the whole radius is lit.
-    away = up - axis * (axis @ up)
-    if np.linalg.norm(away) < 1e-3:
-        away = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    away /= np.linalg.norm(away)
-    angles = half_angle * np.linspace(0, 0.995, SUN_RINGS)
-    radiance = excess(np.cos(angles)[:, None] * axis + np.sin(angles)[:, None] * away)
+    side = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    side /= np.linalg.norm(side)
+    other = np.cross(axis, side)
+    rings = half_angle * np.linspace(0, 0.995, SUN_RINGS)
+    # The mean around each ring: a wide sun is redder towards the horizon.
+    turns = 2 * np.pi * np.arange(SUN_TURNS) / SUN_TURNS
+    around = np.cos(turns)[:, None] * side + np.sin(turns)[:, None] * other
+    d = np.cos(rings)[:, None, None] * axis + np.sin(rings)[:, None, None] * around
+    found = excess(d.reshape(-1, 3)).reshape(*d.shape)
+    seen = (d @ up > 0)[..., None]
+    radiance = (found * seen).sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
     if np.ptp(radiance, axis=0).max() <= 1e-3 * radiance.max():
         radiance = radiance.mean(axis=0, keepdims=True)
     return {
@@ -253,19 +260,26 @@ def _sun_directions(obj: Any, sun: Any, times: F64) -> tuple[F64, NDArray[np.boo
 
     `sun` shows the sun alone; a sky without any light of its own draws no sun either, and counts as one without it.
     """
-    sums, count = np.zeros((len(times), 3)), np.zeros(len(times))
-    side = 64 if len(times) == 1 else 8
-    for u in ((i + 0.5) / side for i in range(side)):
-        for v in ((j + 0.5) / side for j in range(side)):
-            it = mi.Interaction3f() if is_scalar() else dr.zeros(mi.Interaction3f, len(times))
-            it.time = float(times[0]) if is_scalar() else mi.Float(times.astype(np.float32))
-            ds, _ = obj.sample_direction(it, mi.Point2f(u, v))
-            d = np.array(dr.detach(ds.d), np.float64).reshape(3, -1).T
-            lit = _radiance(sun, d, times if len(times) > 1 else float(times[0])).max(axis=1) > 0
-            sums += np.where(lit[:, None], d, 0.0)
-            count += lit
+    side = 16 if is_scalar() else 64 if len(times) == 1 else 8
+    grid = (np.arange(side) + 0.5) / side
+    u = np.stack(np.meshgrid(grid, grid), -1).reshape(-1, 2)
+    if is_scalar():
+        it = mi.Interaction3f()
+        it.time = float(times[0])
+        d = np.array([obj.sample_direction(it, mi.Point2f(*pair))[0].d for pair in u.tolist()])
+        lit = _radiance(sun, d, float(times[0])).max(axis=1) > 0
+    else:
+        each = np.repeat(times, len(u))
+        it = dr.zeros(mi.Interaction3f, len(each))
+        it.time = mi.Float(each.astype(np.float32))
+        pairs = mi.Point2f(np.tile(u, (len(times), 1)).T.astype(np.float32))
+        ds, _ = obj.sample_direction(it, pairs)
+        d = np.array(dr.detach(ds.d), np.float64).T
+        lit = _radiance(sun, d, each).max(axis=1) > 0
+    lit = lit.reshape(len(times), -1)
+    sums = np.where(lit[..., None], d.reshape(len(times), -1, 3), 0.0).sum(axis=1)
     length = np.linalg.norm(sums, axis=1, keepdims=True)
-    return sums / np.maximum(length, 1e-12), count > 0
+    return sums / np.maximum(length, 1e-12), lit.any(axis=1)
 
 
 def _tracks(
