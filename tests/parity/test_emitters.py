@@ -294,7 +294,10 @@ TIMED: dict[str, tuple[float, float, Description]] = {
 """When the shutter opens and closes, and what else is not the default."""
 
 
-@pytest.mark.parametrize("name", TIMED)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.long] if name == "hours" else []) for name in TIMED],
+)
 def test_baked_timed_sunsky_is_mitsubas(name: str) -> None:
     """Sky and sun together have Mitsuba's mean over the shutter's opening: irradiance of five directions to 2 %, and
     away from the sun its radiance to 1 %.
