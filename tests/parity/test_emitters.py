@@ -321,7 +321,7 @@ def test_baked_timed_sunsky_is_mitsubas(name: str) -> None:
     ours = [core.emitter_eval_pdf(i, reference, d)[0] for i in range(2)]
     times = np.linspace(start, end, 1 if start == end else 129)
     times = times if start == end else 0.5 * (times[1:] + times[:-1])
-    si = dr.zeros(mi.SurfaceInteraction3f, len(d))
+    si: Any = dr.zeros(mi.SurfaceInteraction3f, len(d))
     si.wi = -vector3(d)
     theirs = np.zeros((len(d), 3))
     for t in times.tolist():

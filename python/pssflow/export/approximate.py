@@ -132,7 +132,9 @@ def mean_of_texture(texture: Any) -> list[float] | None:
 
 def _surface(uv: Any, wi: Any) -> Any:
     """Points of the xy plane, one or many."""
-    si = mi.SurfaceInteraction3f() if _scalar() else dr.zeros(mi.SurfaceInteraction3f, uv.shape[1])
+    si: Any = (
+        mi.SurfaceInteraction3f() if _scalar() else dr.zeros(mi.SurfaceInteraction3f, uv.shape[1])
+    )
     si.uv, si.wi = mi.Point2f(uv), mi.Vector3f(wi)
     x, y, z = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), mi.Vector3f(0, 0, 1)
     si.n, si.dp_du, si.dp_dv, si.t = mi.Normal3f(z), x, y, 1.0

@@ -237,9 +237,9 @@ def _sun(half_angle: float, excess: Radiance, direction: F64, up: F64) -> Entry:
     other = np.cross(axis, side)
     rings = half_angle * np.linspace(0, 0.995, SUN_RINGS)
     # The mean around each ring: a wide sun is redder towards the horizon.
-    turns = 2 * np.pi * np.arange(SUN_TURNS) / SUN_TURNS
+    turns: F64 = 2 * np.pi * np.arange(SUN_TURNS) / SUN_TURNS
     around = np.cos(turns)[:, None] * side + np.sin(turns)[:, None] * other
-    d = np.cos(rings)[:, None, None] * axis + np.sin(rings)[:, None, None] * around
+    d: NDArray[Any] = np.cos(rings)[:, None, None] * axis + np.sin(rings)[:, None, None] * around
     found = excess(d.reshape(-1, 3)).reshape(*d.shape)
     seen = (d @ up > 0)[..., None]
     radiance = (found * seen).sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
@@ -264,7 +264,7 @@ def _sun_directions(obj: Any, sun: Any, times: F64) -> tuple[F64, NDArray[np.boo
     grid = (np.arange(side) + 0.5) / side
     u = np.stack(np.meshgrid(grid, grid), -1).reshape(-1, 2)
     if is_scalar():
-        it = mi.Interaction3f()
+        it: Any = mi.Interaction3f()
         it.time = float(times[0])
         d = np.array([obj.sample_direction(it, mi.Point2f(*pair))[0].d for pair in u.tolist()])
         lit = _radiance(sun, d, float(times[0])).max(axis=1) > 0
@@ -338,7 +338,7 @@ def _tracks(
 def _radiance(obj: Any, directions: F64, time: float | F64 = 0.0) -> F64:
     """What an emitter at infinity shows in world directions (n, 3), at one time or one each."""
     if is_scalar():
-        si = mi.SurfaceInteraction3f()
+        si: Any = mi.SurfaceInteraction3f()
         si.time = float(time)
         values = np.empty(directions.shape)
         for i, d in enumerate((-directions).tolist()):
