@@ -4,7 +4,7 @@ Errors: a wrong argument is a `ValueError`, a missing file a `FileNotFoundError`
 written an `OSError`, a failure of a library a `RuntimeError`, Ctrl-C a `KeyboardInterrupt`; always one line.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -64,7 +64,7 @@ class Scene:
     def __init__(
         self,
         description: str,
-        arrays: Sequence[NDArray[Any]],
+        arrays: Iterable[NDArray[Any]],
         search_dirs: Sequence[str] = (),
     ) -> None: ...
     @property
@@ -81,8 +81,10 @@ class Scene:
         """JSON: counts of shapes, BSDFs, emitters; triangles, degenerate_triangles, geometry_bytes."""
     def columns(self, k: int, emitter_strategy: str) -> list[str]: ...
     def columns_hash(self, k: int, parametrisation: str) -> str: ...
-    def auto_strategy(self) -> tuple[str, str]:
-        """What `emitter_strategy="auto"` means here, and why."""
+    def auto_strategy(
+        self, *, k: int, parametrisation: str, threads: int = 0
+    ) -> tuple[str, str, float | None]:
+        """What `emitter_strategy="auto"` means here, why, and nee's cost ÷ mis' for one error if it was probed."""
     def trace(
         self,
         u: F32,
@@ -152,6 +154,8 @@ class Scene:
     ) -> tuple[F32, tuple[F32, F32, F32, NDArray[np.bool_]]]:
         """Delta lobes alone, from one number each: their probability (n,), and what `bsdf_sample` returns."""
     def texture_eval(self, texture: int, uv: F32) -> F32: ...
+    def texture_eval_at_hits(self, texture: int, origins: F32, directions: F32) -> tuple[F32, F32]:
+        """A texture's colours (n,3) and scalars (n,) where rays meet surfaces; zero where they meet none."""
     def emitter_eval_pdf(self, emitter: int, reference: F32, directions: F32) -> tuple[F32, F32]:
         """What rays see of an emitter, (n, 3), and its density in solid angle, (n,)."""
 

@@ -81,6 +81,11 @@ def _scene_options(command: F) -> F:
                 "--sensor", type=click.IntRange(0), default=0, show_default=True, help="Its index."
             ),
             click.option(
+                "--approximate",
+                is_flag=True,
+                help="Replace what is not supported, and say what by.",
+            ),
+            click.option(
                 "--variant",
                 help="Mitsuba variant.  [default: llvm_ad_rgb, or scalar_rgb without LLVM]",
             ),
@@ -292,10 +297,10 @@ def compare(
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 @click.pass_obj
 def info(terminal: Terminal, *, as_json: bool, **options: Any) -> None:
-    """Say what was understood of a scene, what is not supported, and which guides there are."""
+    """Say what was understood of a scene, where its light is, what is not supported, and which guides there are."""
     from . import report
-    from .export import inspect_scene
     from .guide import registry
+    from .info import inspect
     from .scene import load_scene, resize_film
 
     notes: list[str] = []
@@ -304,18 +309,10 @@ def info(terminal: Terminal, *, as_json: bool, **options: Any) -> None:
     loaded, name = load_scene(options["scene"], notes, **dict(options["parameters"]))
     if options["size"] or options["scale"]:
         resize_film(loaded, options["sensor"], options["size"], options["scale"])
-    found = inspect_scene(loaded, options["sensor"])
-    for note in [*notes, *found.notes]:
+    found = inspect(loaded, options["sensor"], approximate=options["approximate"])
+    for note in [*notes, *found["notes"]]:
         terminal.note(note)
-    record = {
-        "scene": name,
-        "supported": not found.unsupported,
-        "counts": found.counts,
-        "triangles": found.triangles,
-        "array_bytes": found.array_bytes,
-        "unsupported": [str(thing) for thing in found.unsupported],
-        "guides": registry(),
-    }
+    record = {"scene": name, **found, "guides": registry()}
     if as_json:
         terminal.json(record)
     else:
@@ -378,6 +375,7 @@ def _load(terminal: Terminal, options: Mapping[str, Any]) -> Any:
         options["sensor"],
         size=options["size"],
         scale=options["scale"],
+        approximate=options["approximate"],
         **dict(options["parameters"]),
     )
 

@@ -151,14 +151,20 @@ def reference(
     mi_scene, _ = load_scene(scene, notices)
     camera = scene.sensor if isinstance(scene, Scene) else sensor
     # Anew even for a `Scene`: it may have been edited since, and the cache must not mix two states.
-    exported = export(mi_scene, camera)
+    own = isinstance(scene, Scene)
+    exported = export(
+        mi_scene,
+        camera,
+        hide_emitters=scene.hide_emitters if own else None,
+        approximate=own and scene.approximate,
+    )
     path = _writable_cache(cache, notices, exported, k, seed0)
     total = _load(path, notices) if path is not None else None
     reused = 0 if total is None else total.passes
     film = exported.description["film"]["crop_size"]
     if total is None:
         total = _Running.empty(film, max(PATHS_PER_PASS // (film[0] * film[1]), 1))
-    renderer = _Renderer(mi_scene, camera, k)
+    renderer = _Renderer(mi_scene, camera, k, hide=exported.description["hide_emitters"])
     saved = time.monotonic()
     with reporting(progress) as listener:
         passes = _more(total, renderer, seed0, limit, target, listener)
@@ -276,12 +282,14 @@ class _Running:
 class _Renderer:
     """One pass: the difference of two path integrators."""
 
-    def __init__(self, scene: Any, sensor: Any, k: int) -> None:
+    def __init__(self, scene: Any, sensor: Any, k: int, *, hide: bool) -> None:
         self.scene = scene
         self.camera = select_sensor(scene, sensor)
         self.jit = not scene.variant_name().startswith("scalar")
         self.deep, self.shallow = (
-            mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": k + 2})
+            mi.load_dict(
+                {"type": "path", "max_depth": depth, "rr_depth": k + 2, "hide_emitters": hide}
+            )
             for depth in (k + 1, k)
         )
         self.sample_count = self.camera.sampler().sample_count()

@@ -86,6 +86,8 @@ def render(
     *,
     emitter_strategy: str | None = None,
     sensor: Any = 0,
+    hide_emitters: bool | None = None,
+    approximate: bool = False,
     preset: str | None = None,
     pilot_spp: int | None = None,
     keep_pilot: bool | None = None,
@@ -111,6 +113,8 @@ def render(
         progress: True for bars on stderr if that is a terminal, "always", False, or a function (phase, share done).
         emitter_strategy: `mis` (default), `nee` (emitter samples alone, as the thesis), or `auto`.
         sensor: index of the sensor, or a sensor object.
+        hide_emitters: as in `Scene`, which decides it where one is given. None: what the scene's integrator says.
+        approximate: as in `Scene`, which decides it where one is given: replace what is not supported, with a note.
         preset: `thesis`: NEE alone, a pilot of 16 spp that is discarded, a = 0, then 16 spp from the guide; with
             another `spp`, half for the pilot. What is given beside it wins.
         pilot_spp: samples per pixel of the pilot. Default: a quarter of `spp`, or a seventh of `time`.
@@ -160,17 +164,24 @@ def render(
         **settings,
     )
     if not isinstance(scene, Scene):
-        scene = Scene(scene, sensor)
+        scene = Scene(scene, sensor, hide_emitters=hide_emitters, approximate=approximate)
     elif sensor != 0 and sensor is not scene.sensor and sensor != scene.sensor:
         raise ValueError(
             "`sensor` was given beside a `Scene`, which has its own; make another `Scene`"
+        )
+    elif approximate or hide_emitters is not None:
+        name = "approximate" if approximate else "hide_emitters"
+        raise ValueError(
+            f"`{name}` was given beside a `Scene`, which has its own; make another `Scene`"
         )
     return run(scene, choice, plan, progress)
 
 
 def run(scene: Scene, choice: Choice, plan: Plan, progress: Progress = True) -> Result:
     """Renders with arguments that were checked already; see `render`."""
-    strategy, why = scene.resolve_strategy(plan.emitter_strategy)
+    strategy, why = scene.resolve_strategy(
+        plan.emitter_strategy, plan.k, plan.parametrisation, plan.threads or None
+    )
     hashes = (scene.core.columns_hash(plan.k, plan.parametrisation), scene.hash)
     given = choice.given
     if choice.path is not None:

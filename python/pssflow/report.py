@@ -27,6 +27,9 @@ __all__ = [
     "scene_title",
 ]
 
+MOST_BSDFS = 30
+"""Rows of `pssflow info`'s table of BSDFs."""
+
 PER_ROW = 4
 """Runs side by side in a picture, beside the reference."""
 
@@ -119,7 +122,23 @@ def scene_info(record: Mapping[str, Any]) -> list[Any]:
         if plugins:
             found.add_row(kind, ", ".join(f"{n} {name}" for name, n in plugins.items()))
     found.add_row("triangles", count(record["triangles"]))
-    found.add_row("arrays", f"{record['array_bytes'] / 2**20:.1f} MiB")
+    if record["instances"]:
+        found.add_row("instances", count(record["instances"]))
+    found.add_row("arrays", _mebibytes(record["array_bytes"]))
+    if memory := record["memory"]:
+        parts = ", ".join(f"{name} {_mebibytes(size)}" for name, size in memory.items())
+        found.add_row("memory", parts)
+    if auto := record["auto"]:
+        found.add_row("auto strategy", f"{auto['emitter_strategy']}: {auto['why']}")
+    bsdfs = Table()
+    bsdfs.add_column("BSDF")
+    bsdfs.add_column("shapes", justify="right")
+    bsdfs.add_column("understood as", overflow="fold")
+    for bsdf in record["bsdfs"][:MOST_BSDFS]:
+        bsdfs.add_row(bsdf["id"], count(bsdf["shapes"]), bsdf["what"])
+    more = len(record["bsdfs"]) - MOST_BSDFS
+    if more > 0:
+        bsdfs.add_row(f"and {more} more", "", "all of them with --json")
     guides = Table()
     guides.add_column("guide")
     guides.add_column("what it is; options and defaults for --set")
@@ -128,7 +147,37 @@ def scene_info(record: Mapping[str, Any]) -> list[Any]:
         options = ", ".join(f"{key}={_option(value)}" for key, value in guide["options"].items())
         guides.add_row(name, f"{guide['summary']}\n{options}")
     refused = [f"not supported: {line}" for line in record["unsupported"]]
-    return [record["scene"], found, *(refused or ["Everything in it is supported."]), guides]
+    if refused:
+        refused += [
+            f"with --approximate: {line.partition(': ')[2]}" for line in record["with_approximate"]
+        ]
+        refused.append(
+            "Replace it in the scene, or give --approximate."
+            if record.get("approximate_helps")
+            else "Replace it in the scene, or render it with Mitsuba's `path`."
+        )
+    light = [_probe_table(record["probe"])] if record["probe"] else []
+    verdict = refused or ["Everything in it is supported."]
+    return [record["scene"], found, bsdfs, *light, *verdict, guides]
+
+
+def _probe_table(rows: Sequence[Mapping[str, Any]]) -> Table:
+    """Where the light is, by bounces, from a probe of random paths."""
+    light = Table()
+    light.add_column("light of exactly")
+    for heading in ("mean luminance", "share of these", "paths found", "non-zero"):
+        light.add_column(heading, justify="right")
+    for row in rows:
+        k = row["k"]
+        name = "1 bounce (direct)" if k == 1 else f"{k} bounces"
+        mean = f"{number(row['mean'], 3)} ± {number(row['standard_error'], 2)}"
+        shares = [percent(row[key]) for key in ("share", "found_share", "nonzero_share")]
+        light.add_row(name, mean, *shares)
+    return light
+
+
+def _mebibytes(size: int) -> str:
+    return f"{size / 2**20:.1f} MiB"
 
 
 def scene_title(name: str) -> str:

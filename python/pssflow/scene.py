@@ -15,7 +15,7 @@ import json
 import site
 import sysconfig
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -154,6 +154,10 @@ class Scene:
         size: width and height of the film in pixels in place of the scene's own. The horizontal field of view stays,
             the crop becomes the whole film. Changes the `mi.Scene`.
         scale: factor on the film's size in place of `size`; a crop is scaled with it.
+        hide_emitters: whether camera rays pass through the surfaces of emitters, as Mitsuba's option of that name.
+            None: what the scene's own integrator says.
+        approximate: whether what is not supported is replaced where there is a replacement (a BSDF by a diffuse one
+            of its mean reflectance, a texture by its mean; media and emitters are left out), with a note for each.
         **xml_parameters: values for `$name` in the XML file.
 
     Raises:
@@ -170,6 +174,8 @@ class Scene:
         *,
         size: tuple[int, int] | None = None,
         scale: float | None = None,
+        hide_emitters: bool | None = None,
+        approximate: bool = False,
         **xml_parameters: Any,
     ) -> None:
         self.notes: list[str] = []
@@ -180,10 +186,17 @@ class Scene:
             resize_film(self.mi_scene, sensor, size, scale)
         loaded = time.perf_counter()
         self.sensor = sensor
-        self.exported: Export = export(self.mi_scene, sensor)
+        self.approximate = approximate
+        """Whether unsupported features were to be replaced."""
+        self.exported: Export = export(
+            self.mi_scene, sensor, hide_emitters=hide_emitters, approximate=approximate
+        )
+        """What the renderer was built from. It took the arrays over: there are none in here."""
         self.notes += self.exported.notes
         exported = time.perf_counter()
-        self.core = _core.Scene(self.exported.json(), self.exported.arrays, embree_dirs())
+        arrays = _handed_over(self.exported.arrays)
+        self.core = _core.Scene(self.exported.json(), arrays, embree_dirs())
+        self._strategies: dict[tuple[int, str], tuple[str, str]] = {}
         self.variant = self.mi_scene.variant_name()
         """The Mitsuba variant that loaded it."""
         self.timings: dict[str, float] = {
@@ -292,15 +305,35 @@ class Scene:
 
         return render(self, guide, spp, **options)
 
-    def resolve_strategy(self, emitter_strategy: str) -> tuple[str, str | None]:
-        """`mis` or `nee`, and for `auto` why it means that here."""
+    @property
+    def hide_emitters(self) -> bool:
+        """Whether camera rays pass through the surfaces of emitters."""
+        return self.exported.description["hide_emitters"]
+
+    def resolve_strategy(
+        self,
+        emitter_strategy: str,
+        k: int = 2,
+        parametrisation: str = "bsdf",
+        threads: int | None = None,
+    ) -> tuple[str, str | None]:
+        """`mis` or `nee`, and for `auto` why it means that here.
+
+        A probe of some 100 000 paths tells, the same always; it is made once for each k and parametrisation.
+        """
         if emitter_strategy != "auto":
             return emitter_strategy, None
-        return self.core.auto_strategy()
+        key = (k, parametrisation)
+        if key not in self._strategies:
+            strategy, reason, _ = self.core.auto_strategy(
+                k=k, parametrisation=parametrisation, threads=check_threads(threads)
+            )
+            self._strategies[key] = (strategy, reason)
+        return self._strategies[key]
 
     def _path_options(self, k: int, parametrisation: str, strategy: str) -> tuple[int, str, str]:
         k, parametrisation, strategy = check_path_options(k, parametrisation, strategy)
-        return k, parametrisation, self.resolve_strategy(strategy)[0]
+        return k, parametrisation, self.resolve_strategy(strategy, k, parametrisation)[0]
 
 
 def load_scene(scene: SceneLike, notes: list[str], **xml_parameters: Any) -> tuple[Any, str]:
@@ -393,6 +426,13 @@ def embree_dirs() -> list[str]:
     if site.ENABLE_USER_SITE:
         found.append(Path(site.getusersitepackages()))
     return [str(folder) for folder in dict.fromkeys(found) if folder.is_dir()]
+
+
+def _handed_over(arrays: list[NDArray[Any]]) -> Iterator[NDArray[Any]]:
+    """The arrays one by one, none of them held any longer; the list is empty in the end."""
+    arrays.reverse()
+    while arrays:
+        yield arrays.pop()
 
 
 def _note(notes: list[str], notice: str | None) -> None:

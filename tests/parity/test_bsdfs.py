@@ -85,6 +85,11 @@ def _bumps(nested: Description, **options: Any) -> Description:
     return {"type": "bumpmap", "heights": texture, "nested": nested, "scale": 0.08} | options
 
 
+DISNEY_TEXTURES = (
+    *("roughness", "anisotropic", "spec_trans", "spec_tint", "sheen", "sheen_tint", "flatness"),
+    *("metallic", "clearcoat", "clearcoat_gloss"),
+)
+
 BSDFS: dict[str, Callable[[], Description]] = {
     "diffuse": lambda: {"type": "diffuse", "reflectance": _rgb(0.2, 0.5, 0.8)},
     "diffuse-textured": lambda: {"type": "diffuse", "reflectance": _bitmap(1, 3)},
@@ -253,8 +258,48 @@ BSDFS |= {
     "normalmap-mask": lambda: _bumpy({"type": "mask", "opacity": 0.6, "nested": _coat()}),
 }
 
+BSDFS |= {
+    "conductor-copper": lambda: {"type": "roughconductor", "material": "Cu", "alpha": 0.2},
+    "conductor-spectra": lambda: {
+        "type": "roughconductor",
+        "alpha": 0.3,
+        "eta": {"type": "spectrum", "value": [(400, 1.2), (550, 0.6), (700, 0.2)]},
+        "k": {"type": "spectrum", "value": [(400, 2.1), (550, 2.6), (700, 4.2)]},
+    },
+    "conductor-textured-anisotropic": lambda: _gold(
+        distribution="ggx",
+        alpha_u=_bitmap(40, 1),
+        alpha_v=_bitmap(41, 1),
+        eta=_bitmap(42, 3),
+        k=_bitmap(43, 3),
+    ),
+    "plastic-named-ior": lambda: _plastic(alpha=0.2, int_ior="polypropylene", ext_ior="water"),
+    "coat-named-ior": lambda: _coat(int_ior="acrylic glass", ext_ior="water ice"),
+    "rough-glass-named-ior": lambda: _rough_glass(alpha=0.3, int_ior="bk7", ext_ior="vacuum"),
+    "rough-glass-textured-anisotropic": lambda: _rough_glass(
+        distribution="ggx", alpha_u=_bitmap(44, 1), alpha_v=_bitmap(45, 1)
+    ),
+    "disney-all-textured": lambda: _disney(
+        **{name: _bitmap(50 + i, 1) for i, name in enumerate(DISNEY_TEXTURES)}
+    ),
+    "sheet-all-textured": lambda: _sheet(
+        **{name: _bitmap(70 + i, 1) for i, name in enumerate((*DISNEY_TEXTURES[:7], "diff_trans"))}
+    ),
+    "checkerboard-weight": lambda: {
+        "type": "blendbsdf",
+        "weight": {"type": "checkerboard", "color0": 0.2, "color1": 0.7},
+        "a": {"type": "diffuse", "reflectance": {"type": "checkerboard"}},
+        "b": _gold(alpha=0.3),
+    },
+}
+
 DELTA: dict[str, Callable[[], Description]] = {
     "mirror": lambda: {"type": "conductor", "specular_reflectance": _rgb(0.9, 0.8, 0.7)},
+    "mirror-spectra": lambda: {
+        "type": "conductor",
+        "eta": {"type": "spectrum", "value": [(400, 1.2), (700, 0.2)]},
+        "k": {"type": "spectrum", "value": [(400, 2.1), (700, 4.2)]},
+    },
     "mirror-gold": lambda: {"type": "conductor", "material": "Au"},
     "mirror-textured": lambda: {
         "type": "conductor",

@@ -286,6 +286,69 @@ def test_baked_sunsky_is_mitsubas(name: str) -> None:
         assert np.count_nonzero(bad) <= 50, first_rows(bad, d=drawn["d"], pdf=pdf, u=u)
 
 
+TIMED: dict[str, tuple[float, float, Description]] = {
+    "moment": (0.3001, 0.3001, {}),
+    "complex": (0.5504, 0.5504, {"complex_sun": True, "sun_aperture": 8.0}),
+    "hours": (0.0, 1.0, {"end_year": 2025, "end_month": 1, "end_day": 1, "sun_aperture": 5.0}),
+}
+"""When the shutter opens and closes, and what else is not the default."""
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.long] if name == "hours" else []) for name in TIMED],
+)
+def test_baked_timed_sunsky_is_mitsubas(name: str) -> None:
+    """Sky and sun together have Mitsuba's mean over the shutter's opening: irradiance of five directions to 2 %, and
+    away from the sun its radiance to 1 %.
+    """
+    mi.set_variant(LLVM)
+    start, end, options = TIMED[name]
+    turn = mi.ScalarTransform4f().rotate([1, 0, 0], -90)
+    film = {"type": "hdrfilm", "width": 8, "height": 8}
+    camera = {"type": "perspective", "shutter_open": start, "shutter_close": end, "film": film}
+    lamp = {"type": "timed_sunsky", "to_world": turn} | options
+    scene = mi.load_dict({"type": "scene", "camera": camera, "b": {"type": "rectangle"}, "l": lamp})
+    core, exported = core_scene(scene)
+    emitters = exported.description["emitters"]
+    assert len(exported.emitter_order) == len(emitters) == 2
+    assert any("values of Mitsuba's" in note for note in exported.notes)
+
+    rng = np.random.default_rng(37)
+    d = sphere_directions(rng, 50_000)
+    d[:, 1] = np.abs(d[:, 1])
+    reference = np.tile(np.array([[50, 60, -70]], np.float32), (len(d), 1))
+    ours = [core.emitter_eval_pdf(i, reference, d)[0] for i in range(2)]
+    times = np.linspace(start, end, 1 if start == end else 129)
+    times = times if start == end else 0.5 * (times[1:] + times[:-1])
+    si: Any = dr.zeros(mi.SurfaceInteraction3f, len(d))
+    si.wi = -vector3(d)
+    theirs = np.zeros((len(d), 3))
+    for t in times.tolist():
+        si.time = mi.Float(t)
+        theirs += points(scene.emitters()[0].eval(si)) / len(times)
+    both = ours[0] + ours[1]
+    for n in ([0, 1, 0], [1, 0.2, 0], [-1, 0.2, 0], [0, 0.2, 1], [0, 0.2, -1]):
+        cosine = np.maximum(d @ (np.array(n, np.float32) / np.linalg.norm(n)), 0)[:, None]
+        np.testing.assert_allclose((both * cosine).mean(0), (theirs * cosine).mean(0), rtol=2e-2)
+    sky = ours[1].max(axis=1) == 0
+    wrong = disagreements(both, theirs.astype(np.float32), rel=1e-2, floor=1e-3)
+    wrong &= sky & (d[:, 1] > 1e-3)
+    # The sun's rim: where one of the two still shows it.
+    assert np.count_nonzero(wrong) <= len(d) / 1000, first_rows(
+        wrong, d=d, both=both, theirs=theirs
+    )
+
+    u = unit_interval(rng, 5000, 2)
+    for i in range(2):
+        drawn = core.emitter_sample(i, reference[:5000], u)
+        radiance, pdf = core.emitter_eval_pdf(i, reference[:5000], drawn["d"])
+        lit = drawn["pdf"] > 0
+        bad = lit & disagreements(pdf, drawn["pdf"], rel=1e-2, floor=1e-3)
+        bad |= lit & disagreements(radiance, drawn["radiance"], rel=1e-2, floor=1e-2)
+        assert np.count_nonzero(bad) <= 50, first_rows(bad, d=drawn["d"], pdf=pdf, u=u)
+
+
 def test_laser_gives_no_light_to_a_path() -> None:
     """A `directionalarea` is drawn as any other light, and its every sample is empty: in both."""
     mi.set_variant(LLVM)

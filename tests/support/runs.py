@@ -12,9 +12,14 @@ Runs = NDArray[np.float32]
 
 
 def mitsuba_runs(scene: mi.Scene, *, max_depth: int, seeds: Iterable[int], spp: int) -> Runs:
-    """Mitsuba's `path`, one image a seed, in the scene's own film."""
+    """Mitsuba's `path`, one image a seed, in the scene's own film.
+
+    Emitters hide where the scene's integrator hides them.
+    """
     # Roulette would draw numbers and end paths that the difference of two depths needs.
-    path = mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": max_depth + 2})
+    hide = bool(getattr(scene.integrator(), "hide_emitters", False))
+    depths = {"max_depth": max_depth, "rr_depth": max_depth + 2}
+    path = mi.load_dict({"type": "path", "hide_emitters": hide, **depths})
     images = []
     for seed in seeds:
         image = mi.render(scene, integrator=path, spp=spp, seed=seed)  # pyright: ignore[reportArgumentType]

@@ -14,6 +14,7 @@ import pytest
 
 import pssflow
 from pssflow import guide as guides
+from pssflow.export import export
 from pssflow.options import PRESETS, Plan, read_replay
 from pssflow.reference import reference
 from tests import scenes
@@ -184,6 +185,25 @@ def test_preset_thesis(furnace):
     stats = quick(furnace, "none", None, preset="thesis").stats
     assert [(entry["kind"], entry["spp"]) for entry in stats["passes"]] == [("uniform", 16)]
     assert set(PRESETS) == {"thesis"}
+
+
+def test_the_renderer_takes_the_arrays_over(llvm_variant):
+    """It holds the scene's arrays once, bytes as bytes; nothing of the export keeps them alive."""
+    texels = np.random.default_rng(1).integers(0, 255, (64, 64, 3), dtype=np.uint8)
+    photo = {"type": "bitmap", "bitmap": mi.Bitmap(texels)}
+    court = scenes.open_sky() | {
+        "photo": {"type": "cube", "bsdf": {"type": "diffuse", "reflectance": photo}}
+    }
+    exported = export(mi.load_dict(court))
+    bitmaps = [e for e in exported.description["textures"] if e["type"] == "bitmap"]
+    assert {exported.arrays[entry["data"]].dtype.name for entry in bitmaps} >= {"uint8"}
+    held = pssflow.Scene(court)
+    assert held.exported.arrays == []
+    summary = held.summary
+    size = sum(array.nbytes for array in exported.arrays)
+    # Rectangles come without arrays; a table of 256 numbers goes with each bitmap of bytes.
+    assert summary["geometry_bytes"] + summary["texture_bytes"] < size + 8192
+    assert summary["bvh_bytes"] > 0
 
 
 def test_auto_strategy_says_why(furnace):

@@ -494,13 +494,43 @@ def test_info_says_what_was_understood(command):
     record = json.loads(command("info", CORNELL, *TINY, "--json").out)
     assert record["supported"]
     assert record["triangles"] == 36
+    assert record["auto"]["emitter_strategy"] in outcome.out
+    assert record["auto"]["why"]
+    assert {bsdf["id"] for bsdf in record["bsdfs"]} == {"white", "black", "red", "green"}
+    assert record["bsdfs"][0]["what"].startswith("twosided(diffuse(reflectance=(")
+    assert record["memory"]["bvh"] > 0
+    assert [row["k"] for row in record["probe"]] == [1, 2, 3]
+    assert sum(row["share"] for row in record["probe"]) == pytest.approx(1)
+    assert record["probe"][0]["mean"] > 10 * record["probe"][0]["standard_error"]
 
 
 def test_info_lists_what_is_not_supported(command, files):
     record = json.loads(command("info", "hair.xml", "--variant", "scalar_rgb", "--json").out)
     assert not record["supported"]
     assert "hair" in record["unsupported"][0]
-    assert command("info", "hair.xml").code == 0
+    assert record["probe"] is None
+    outcome = command("info", "hair.xml", "--variant", "scalar_rgb")
+    assert outcome.code == 0
+    assert "with --approximate: " in outcome.out
+    assert "replaced by a diffuse one" in outcome.out.replace("\n", " ")
+    record = json.loads(
+        command("info", "hair.xml", "--variant", "scalar_rgb", "--approximate", "--json").out
+    )
+    assert record["supported"]
+    assert record["probe"]
+    assert "hair" in record["notes"][0]
+
+
+def test_what_is_not_supported_is_rendered_approximately(command, files):
+    arguments = ("render", "hair.xml", "-o", "a.exr", "--guide", "none", "--spp", 1, "--k", 1)
+    outcome = command(*arguments, "--variant", "scalar_rgb")
+    assert outcome.code != 0
+    assert "--approximate" in outcome.err
+    assert not Path("a.exr").exists()
+    outcome = command(*arguments, "--variant", "scalar_rgb", "--approximate")
+    assert outcome.code == 0, outcome.err
+    assert "approximated" in outcome.err
+    assert Path("a.exr").exists()
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import mitsuba as mi
+import numpy as np
 import pytest
 
 from pssflow.export import SUPPORTED, UnsupportedError, export, inspect_scene
@@ -53,6 +54,30 @@ REFUSED: dict[str, tuple[Description, str]] = {
         {"camera": {"type": "batch", "left": {"type": "perspective"}}},
         r'sensor "batch" \("camera"\) is not supported \(supported sensors: orthographic',
     ),
+    "signed distances": (
+        {"blob": {"type": "sdfgrid", "grid": "grid"}},
+        r'shape "blob": plugin "sdfgrid" is not supported \(supported shapes: blender, cube',
+    ),
+    "hair": (
+        {"head": {"type": "sphere", "b": {"type": "hair"}}},
+        r'shape "head": BSDF "hair" \("head.bsdf"\) is not supported \(supported BSDFs: blendbsdf',
+    ),
+    "distant sensor": (
+        {"camera": {"type": "distant", "film": {"type": "hdrfilm", "width": 1, "height": 1}}},
+        r'sensor "distant" \("camera"\) is not supported \(supported sensors: orthographic',
+    ),
+    "volume": (
+        {
+            "ball": {
+                "type": "sphere",
+                "b": {
+                    "type": "diffuse",
+                    "reflectance": {"type": "volume", "volume": {"type": "constvolume"}},
+                },
+            }
+        },
+        r'shape "ball": texture "volume" \("ball.bsdf.reflectance"\) is not supported',
+    ),
     "spectrum": (
         {"bulb": {"type": "point", "intensity": {"type": "blackbody", "temperature": 3000.0}}},
         r'texture "blackbody" \("bulb.intensity"\) is not supported \(supported textures: bitmap',
@@ -69,6 +94,9 @@ def test_refusals_name_the_offender(scalar_variant: str, case: str) -> None:
     parts, message = REFUSED[case]
     if case == "scaled light":  # transforms exist only in a variant
         parts = {"lamp": parts["lamp"] | {"to_world": mi.ScalarTransform4f().scale(2)}}
+    if case == "signed distances":
+        grid = (np.indices((4, 4, 4)).sum(axis=0) - 4.5).astype(np.float32)[..., None]
+        parts = {"blob": parts["blob"] | {"grid": mi.TensorXf(grid)}}
     with pytest.raises(UnsupportedError, match=message):
         export(load(**parts))
 
@@ -85,11 +113,19 @@ def test_what_is_no_scene_is_a_type_error(variant: str) -> None:
             export(thing)
 
 
-def test_other_variants_are_refused() -> None:
-    mi.set_variant("scalar_spectral")
+@pytest.mark.parametrize(
+    "name", ["scalar_spectral", "scalar_spectral_polarized", "llvm_ad_mono", "llvm_ad_spectral"]
+)
+def test_variants_of_other_colours_are_refused(name: str) -> None:
+    """Also where the scene may be approximated: nothing stands in for a spectrum."""
+    mi.set_variant(name)
     scene = load(ball={"type": "sphere"})
-    with pytest.raises(UnsupportedError, match=r'"scalar_spectral" is not supported .*scalar_rgb'):
-        export(scene)
+    for approximate in (False, True):
+        with pytest.raises(UnsupportedError, match=rf'"{name}" is not supported .*scalar_rgb'):
+            export(scene, approximate=approximate)
+
+
+def test_another_active_variant_is_refused() -> None:
     mi.set_variant("scalar_rgb")
     scene = load(ball={"type": "sphere"})
     mi.set_variant("llvm_ad_rgb")

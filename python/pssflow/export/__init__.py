@@ -24,6 +24,7 @@ import mitsuba as mi
 from numpy.typing import NDArray
 
 from .bsdfs import BSDFS
+from .describe import understood
 from .emitters import EMITTERS, ordered_emitters
 from .sensors import FILMS, SENSORS, export_sensor, select_sensor
 from .shapes import SHAPES, export_shape, ordered_shapes
@@ -74,7 +75,7 @@ class Export:
     description: Entry
     """The description, of numbers, strings, lists and dictionaries only. Arrays are named by their index."""
     arrays: list[NDArray[Any]]
-    """C-contiguous float32 or uint32. In LLVM variants they may share Mitsuba's memory: don't write to them."""
+    """C-contiguous float32, uint8 or uint32. In LLVM variants they may share Mitsuba's memory: don't write to them."""
     shape_order: list[int]
     """For each shape of the description its position in `scene.shapes()`, which differs between processes."""
     emitter_order: list[int]
@@ -99,18 +100,29 @@ class Inspection:
     """Of all supported meshes, two for each rectangle; those of groups once, however many instances show them."""
     array_bytes: int
     """Size of all arrays."""
+    bsdfs: list[dict[str, Any]]
+    """Every BSDF that a shape wears: `id`, `shapes` (how many wear it), `what` (in words)."""
     unsupported: list[Unsupported]
     """Everything that `export` would refuse; empty if the scene can be rendered."""
     notes: list[str]
     """As in `Export`."""
 
 
-def export(scene: Any, sensor: Any = 0) -> Export:
+def export(
+    scene: Any,
+    sensor: Any = 0,
+    *,
+    hide_emitters: bool | None = None,
+    approximate: bool = False,
+) -> Export:
     """Exports a scene in its current state.
 
     Args:
         scene: an `mi.Scene` of one of `VARIANTS`, which must be the active one.
         sensor: index of one of its sensors, or a sensor object.
+        hide_emitters: whether camera rays pass through the surfaces of emitters; None for what the scene's integrator
+            says, as it would render it.
+        approximate: whether what is not supported is replaced where there is a replacement; a note names each.
 
     Raises:
         UnsupportedError: the scene holds what cannot be rendered. All of it was looked for; the first few are named.
@@ -118,7 +130,7 @@ def export(scene: Any, sensor: Any = 0) -> Export:
         TypeError: `scene` is no scene.
     """
     start = time.perf_counter()
-    walk, shapes, emitters, (camera, film) = _walk(scene, sensor)
+    walk, shapes, emitters, (camera, film) = _walk(scene, sensor, approximate=approximate)
     if walk.unsupported:
         raise UnsupportedError(_explain(walk.unsupported))
     description = {
@@ -131,6 +143,7 @@ def export(scene: Any, sensor: Any = 0) -> Export:
         "emitters": walk.entries["emitter"],
         "sensor": camera,
         "film": film,
+        "hide_emitters": hides_emitters(scene) if hide_emitters is None else bool(hide_emitters),
     }
     return Export(
         description=description,
@@ -142,14 +155,19 @@ def export(scene: Any, sensor: Any = 0) -> Export:
     )
 
 
-def inspect_scene(scene: Any, sensor: Any = 0) -> Inspection:
+def hides_emitters(scene: Any) -> bool:
+    """Whether the scene's integrator hides the surfaces of emitters from the camera; by default Mitsuba shows them."""
+    return bool(getattr(scene.integrator(), "hide_emitters", False))
+
+
+def inspect_scene(scene: Any, sensor: Any = 0, *, approximate: bool = False) -> Inspection:
     """Goes through a scene as `export` does, but reports what is unsupported instead of raising.
 
     Raises:
         UnsupportedError: the scene's variant is not supported.
         ValueError, TypeError: as in `export`.
     """
-    walk, *_ = _walk(scene, sensor)
+    walk, *_ = _walk(scene, sensor, approximate=approximate)
     shapes = walk.entries["shape"] + [
         shape for group in walk.entries["group"] for shape in group["shapes"]
     ]
@@ -159,6 +177,7 @@ def inspect_scene(scene: Any, sensor: Any = 0) -> Inspection:
         counts={kind: dict(sorted(walk.counts[kind].items())) for kind in SUPPORTED},
         triangles=triangles + 2 * walk.counts["shape"]["rectangle"],
         array_bytes=sum(array.nbytes for array in walk.arrays),
+        bsdfs=understood(walk.entries, walk.arrays),
         unsupported=walk.unsupported,
         notes=walk.notes,
     )
@@ -178,17 +197,20 @@ def stable_emitter_order(scene: Any) -> list[int]:
 
 
 def _walk(
-    scene: Any, sensor: Any
+    scene: Any, sensor: Any, *, approximate: bool
 ) -> tuple[Walk, list[Any], list[Any], tuple[Entry | None, Entry | None]]:
     """Visits everything once; returns the walk, shapes and emitters in the description's order, and sensor and film."""
     _check_scene(scene)
     camera = select_sensor(scene, sensor)
     # Mitsuba calls children without an id `object_<address>`: no name for a second process.
     children = Fields(scene).children.items()
-    walk = Walk({child: name for name, child in children if not name.startswith("object_")})
+    names = {child: name for name, child in children if not name.startswith("object_")}
+    walk = Walk(names, approximate=approximate)
     walk.groups = {
         child.id(): child for _, child in children if class_of(child) == "ShapeGroupPlugin"
     }
+
+    walk.shutter = (float(camera.shutter_open()), float(camera.shutter_open_time()))
 
     shapes = ordered_shapes(scene.shapes())
     emitters = ordered_emitters(scene.emitters(), shapes)
@@ -204,14 +226,8 @@ def _walk(
     walk.shape = None
     # Emitters that came out of another one: behind all others, whose indices stay.
     walk.entries["emitter"] += walk.entries["sun"]
-    suns = [emitter for _, emitter, _ in emitters if class_of(emitter) == "SunskyEmitter"]
-    emitters += [("", sun, None) for sun in suns[: len(walk.entries["sun"])]]
+    emitters += [("", sky, None) for sky in walk.suns]
     entries = export_sensor(walk, camera)
-    hides = getattr(scene.integrator(), "hide_emitters", False)
-    if hides and walk.counts["emitter"]["area"]:
-        walk.notes.append(
-            "`hide_emitters` is ignored: the camera sees the surfaces of lights, not what lies behind them"
-        )
     return walk, [shape for _, shape in shapes], [emitter for _, emitter, _ in emitters], entries
 
 
@@ -250,7 +266,10 @@ def _explain(unsupported: list[Unsupported]) -> str:
     kinds = [kind for kind in unknown if kind in SUPPORTED]
     supported = "; ".join(f"{kind}s: {', '.join(SUPPORTED[kind])}" for kind in kinds)
     hint = f" (supported {supported})" if supported else ""
-    return f"{named}{counted}{hint}. Replace them in the scene, or render this scene with Mitsuba's `path`"
+    remedy = "Replace them in the scene, "
+    if all(thing.instead is not None for thing in unsupported):
+        remedy += "let `--approximate` (in Python `approximate=True`) replace them, "
+    return f"{named}{counted}{hint}. {remedy}or render this scene with Mitsuba's `path`"
 
 
 def _positions(objects: list[Any], ordered: list[Any]) -> list[int]:

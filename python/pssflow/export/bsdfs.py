@@ -28,7 +28,8 @@ DISTRIBUTIONS = {"beckmann": "beckmann", "ggx": "ggx"}
 
 def export_bsdf(walk: Walk, obj: Any, where: str) -> int:
     """Index of a BSDF in the description; those that it nests come before it."""
-    return walk.shared(BSDFS, "BSDF", obj, where)
+    walk.bsdfs = BSDFS
+    return walk.bsdf(obj, where)
 
 
 def _diffuse(walk: Walk, obj: Any, where: str) -> Entry:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .shapes import checked_matrix
+from .sky import LENGTH_TOLERANCE, LUMINANCE, export_sunsky, export_timed_sunsky
 from .textures import constant_value, export_texture
 from .walk import (
     Converter,
@@ -22,23 +23,10 @@ from .walk import (
     Walk,
     class_of,
     floats,
-    is_scalar,
     number,
     plugin_of,
-    printed,
+    sampling_weight,
 )
-
-LENGTH_TOLERANCE = 1e-3
-"""By how much a direction's length may miss 1 in a light's `to_world`: Mitsuba does not normalise there."""
-
-SKY_WIDTH, SKY_HEIGHT = 512, 201
-"""Size of the image that a `sunsky` becomes: a degree a texel or less, and rows that crowd at the horizon."""
-
-SUN_RINGS = 17
-"""Values of a sun's radiance between its centre and its rim, where it is not the same all over."""
-
-LUMINANCE = np.array([0.212671, 0.715160, 0.072169], np.float32)
-"""Weights of linear sRGB, Mitsuba's."""
 
 
 def ordered_emitters(
@@ -77,20 +65,24 @@ def _area(walk: Walk, obj: Any, where: str, shape: Any, index: int | None) -> En
     if shape is None or index is None:
         raise RefusedError("has no shape")
     radiance = Fields(obj)["radiance"]
+    if class_of(radiance) == "MeshAttribute":
+        raise RefusedError(
+            "has a `mesh_attribute` as `radiance`, which Mitsuba itself samples as black; use a bitmap"
+        )
     # Mitsuba finds the place of a texel on the shape through uv, and throws here without them.
     if radiance.is_spatially_varying() and shape.is_mesh() and not shape.has_vertex_texcoords():
         raise RefusedError("has a textured `radiance` on a mesh without texture coordinates")
     return {
         "shape": index,
         "radiance": export_texture(walk, radiance, f"{where}.radiance"),
-        "sampling_weight": _sampling_weight(obj),
+        "sampling_weight": sampling_weight(obj),
     }
 
 
 def _constant(walk: Walk, obj: Any, where: str, _shape: Any, _index: int | None) -> Entry:
     return {
         "radiance": constant_value(walk, Fields(obj)["radiance"], f"{where}.radiance"),
-        "sampling_weight": _sampling_weight(obj),
+        "sampling_weight": sampling_weight(obj),
     }
 
 
@@ -99,7 +91,7 @@ def _point(walk: Walk, obj: Any, where: str, _shape: Any, _index: int | None) ->
     return {
         "position": floats(fields["position"], 3, "position"),
         "intensity": constant_value(walk, fields["intensity"], f"{where}.intensity"),
-        "sampling_weight": _sampling_weight(obj),
+        "sampling_weight": sampling_weight(obj),
     }
 
 
@@ -119,7 +111,7 @@ def _envmap(walk: Walk, obj: Any, _where: str, _shape: Any, _index: int | None) 
         "scale": number(fields["scale"], "scale"),
         "to_world": to_world,
         "mis_compensation": _compensates(obj, texels, linear),
-        "sampling_weight": _sampling_weight(obj),
+        "sampling_weight": sampling_weight(obj),
     }
 
 
@@ -155,127 +147,14 @@ def _directional(walk: Walk, obj: Any, where: str, _shape: Any, _index: int | No
     return {
         "direction": _unit(to_world[:3, 2]),
         "irradiance": constant_value(walk, fields["irradiance"], f"{where}.irradiance"),
-        "sampling_weight": _sampling_weight(obj),
+        "sampling_weight": sampling_weight(obj),
     }
 
 
 def _directional_area(_walk: Walk, obj: Any, _where: str, _shape: Any, index: int | None) -> Entry:
     if index is None:
         raise RefusedError("has no shape")
-    return {"shape": index, "sampling_weight": _sampling_weight(obj)}
-
-
-def _sunsky(walk: Walk, obj: Any, where: str, _shape: Any, _index: int | None) -> Entry:
-    """The sky as an image of the upper half; the sun, where there is one, as an emitter behind all others.
-
-    Both are Mitsuba's own values: of a sky like this one without a sun, and of what this one has more.
-    """
-    fields = Fields(obj)
-    to_world = np.reshape(checked_matrix(fields["to_world"]), (4, 4))
-    linear = to_world[:3, :3]
-    if np.abs(linear.T @ linear - np.eye(3)).max() > LENGTH_TOLERANCE:
-        raise RefusedError("has a `to_world` that scales; turn or mirror it only")
-    names = ("turbidity", "sky_scale", "sun_scale")
-    numbers = {name: number(fields[name], name) for name in names}
-    direction = np.array(floats(fields["sun_direction"], 3, "sun_direction"))
-    sky: Any = mi.load_dict(
-        {
-            "type": "sunsky",
-            "to_world": mi.ScalarTransform4f(to_world.tolist()),
-            "sun_direction": direction.tolist(),
-            "turbidity": numbers["turbidity"],
-            "sky_scale": numbers["sky_scale"],
-            "sun_scale": 0.0,
-            "albedo": fields["albedo"],
-        }
-    )
-    # The image's own axes: y is up.
-    turned = linear @ np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-
-    def directions(x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.float64]:
-        """World directions of columns and rows; the last row is just above the horizon."""
-        phi = 2 * np.pi * (x + 0.5) / SKY_WIDTH
-        up = np.maximum(np.pi / 2 * (1 - y / (SKY_HEIGHT - 1)) ** 2, 1e-6)
-        local = [np.sin(phi) * np.cos(up), np.sin(up), -np.cos(phi) * np.cos(up)]
-        return np.stack(np.broadcast_arrays(*local), -1).reshape(-1, 3) @ turned.T
-
-    column, row = np.arange(SKY_WIDTH)[None, :], np.arange(SKY_HEIGHT)[:, None]
-    texels = _radiance(sky, directions(column, row)).reshape(SKY_HEIGHT, SKY_WIDTH, 3)
-    # Where bilinear interpolation is at its worst: between four texels, on a coarse grid of places.
-    x, y = np.meshgrid(np.arange(3, SKY_WIDTH - 1, 17), np.arange(0, SKY_HEIGHT - 1, 5))
-    corners = [texels[y + j, x + i] for i in (0, 1) for j in (0, 1)]
-    between = np.mean(corners, axis=0).reshape(-1, 3)
-    there = _radiance(sky, directions(x + 0.5, y + 0.5))
-    if there.max() > 0:
-        error = np.abs(between - there).max(axis=1) / np.maximum(there.max(axis=1), 1e-6)
-        walk.notes.append(
-            f'"{where}": the sky is an image of {SKY_WIDTH}×{SKY_HEIGHT} values of Mitsuba\'s; '
-            f"between them its radiance is off by {error.mean():.2%} on average, {error.max():.1%} at the most"
-        )
-
-    weight = _sampling_weight(obj)
-    up = 1 - row / (SKY_HEIGHT - 1)
-    power = float((texels @ LUMINANCE * np.cos(np.pi / 2 * up**2) * up).mean()) * 2 * np.pi**2
-    if numbers["sun_scale"] > 0 and (linear.T @ direction)[2] > 0:
-        sun = _sun(obj, sky, direction, linear[:, 2])
-        middle = np.array(sun["radiance"]).mean(axis=0)
-        sun_power = float(middle @ LUMINANCE) * np.pi * sun["half_angle"] ** 2
-        share = float(np.clip(sun_power / max(sun_power + power, 1e-30), 0.1, 0.9))
-        sun |= {"type": "sun", "id": f"{where}.sun", "sampling_weight": weight * share}
-        walk.entries["sun"].append(sun)
-        weight *= 1 - share
-    return {
-        "data": walk.add_array(np.ascontiguousarray(texels, np.float32)),
-        "scale": 1.0,
-        "to_world": np.block([[turned, np.zeros((3, 1))], [np.eye(4)[3:]]]).ravel().tolist(),
-        "upper_half": True,
-        "sampling_weight": weight,
-    }
-
-
-def _sun(obj: Any, sky: Any, direction: NDArray[np.float64], up: NDArray[np.float64]) -> Entry:
-    """The sun of a `sunsky`: its size, and its radiance from the centre to the rim."""
-    axis = direction / np.linalg.norm(direction)
-    # Away from the horizon, so that the whole radius is lit.
-    away = up - axis * (axis @ up)
-    if np.linalg.norm(away) < 1e-3:
-        away = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    away /= np.linalg.norm(away)
-
-    def excess(angles: NDArray[np.float64]) -> NDArray[np.float64]:
-        d: NDArray[Any] = np.cos(angles)[:, None] * axis + np.sin(angles)[:, None] * away
-        return _radiance(obj, d) - _radiance(sky, d)
-
-    # Shown nowhere else; where its light ends is blurred by more than six digits.
-    aperture = printed(obj).get("Sun aperture", "")
-    try:
-        half_angle = np.deg2rad(float(aperture)) / 2
-    except ValueError:
-        raise RefusedError(f'has a `sun_aperture` that cannot be read: "{aperture}"') from None
-    angles = half_angle * np.linspace(0, 0.995, SUN_RINGS)
-    radiance = excess(angles)
-    if np.ptp(radiance, axis=0).max() <= 1e-3 * radiance.max():
-        radiance = radiance.mean(axis=0, keepdims=True)
-    return {
-        "direction": axis.tolist(),
-        "up": up.tolist(),
-        "half_angle": float(half_angle),
-        "radiance": radiance.tolist(),
-    }
-
-
-def _radiance(obj: Any, directions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What an emitter at infinity shows in world directions (n, 3)."""
-    if is_scalar():
-        si = mi.SurfaceInteraction3f()
-        values = np.empty(directions.shape)
-        for i, d in enumerate((-directions).tolist()):
-            si.wi = mi.Vector3f(d)
-            values[i] = obj.eval(si)
-        return values
-    si = dr.zeros(mi.SurfaceInteraction3f, len(directions))
-    si.wi = mi.Vector3f(np.ascontiguousarray(-directions.T, np.float32))
-    return np.array(dr.detach(obj.eval(si)), np.float64).T
+    return {"shape": index, "sampling_weight": sampling_weight(obj)}
 
 
 def _spot(walk: Walk, obj: Any, where: str, _shape: Any, _index: int | None) -> Entry:
@@ -289,7 +168,7 @@ def _spot(walk: Walk, obj: Any, where: str, _shape: Any, _index: int | None) -> 
         else None,
         "cutoff_angle": number(fields["cutoff_angle"], "cutoff_angle"),
         "beam_width": number(fields["beam_width"], "beam_width"),
-        "sampling_weight": _sampling_weight(obj),
+        "sampling_weight": sampling_weight(obj),
     }
 
 
@@ -315,7 +194,7 @@ def _projector(walk: Walk, obj: Any, where: str, _shape: Any, _index: int | None
         "irradiance": export_texture(walk, fields["irradiance"], f"{where}.irradiance"),
         "scale": number(fields["scale"], "scale"),
         "half_size": half_size,
-        "sampling_weight": _sampling_weight(obj),
+        "sampling_weight": sampling_weight(obj),
     }
 
 
@@ -328,7 +207,8 @@ EMITTERS: dict[str, Converter] = {
     "PointLight": Converter("point", "point", _point),
     "Projector": Converter("projector", "projector", _projector),
     "SpotLight": Converter("spot", "spot", _spot),
-    "SunskyEmitter": Converter("sunsky", "envmap", _sunsky),
+    "SunskyEmitter": Converter("sunsky", "envmap", export_sunsky),
+    "TimedSunskyEmitter": Converter("timed_sunsky", "envmap", export_timed_sunsky),
 }
 
 
@@ -337,7 +217,3 @@ def _unit(direction: NDArray[np.float64]) -> list[float]:
     if abs(np.linalg.norm(direction) - 1) > LENGTH_TOLERANCE:
         raise RefusedError("has a `to_world` that scales; turn, move or mirror it only")
     return direction.tolist()
-
-
-def _sampling_weight(obj: Any) -> float:
-    return number(obj.sampling_weight(), "sampling_weight")

@@ -72,11 +72,46 @@ def _entry(walk: Walk, key: str, shape: Any, emitter: int | None) -> Entry | Non
     if entry is not None and entry["type"] != "instance":
         for medium in (shape.interior_medium(), shape.exterior_medium()):
             if medium is not None:
-                walk.refuse("medium", plugin_of(medium), key)
+                walk.refuse("medium", plugin_of(medium), key, instead="is left out")
         entry["bsdf"] = export_bsdf(walk, shape.bsdf(), f"{key}.bsdf")
+        _attributes(walk, key, shape, entry)
         entry["emitter"] = emitter
     walk.shape = outer
     return entry
+
+
+def _attributes(walk: Walk, key: str, shape: Any, entry: Entry) -> None:
+    """Adds the attributes that the shape's BSDF asks for."""
+    wanted = walk.attributes_of(shape.bsdf())
+    held = []
+    for name in wanted:
+        per, _, _ = name.partition("_")
+        parameters = Fields(shape)
+        if not shape.is_mesh() or name not in parameters or per not in ("vertex", "face"):
+            walk.refuse(
+                "texture",
+                "mesh_attribute",
+                key,
+                f'asks for the attribute "{name}", which the shape does not hold',
+                "is black there",
+            )
+            continue
+        count = shape.vertex_count() if per == "vertex" else shape.face_count()
+        values = rows(parameters[name], 1, np.float32, name)
+        channels = values.size // max(count, 1)
+        if channels not in (1, 3) or values.size != channels * count:
+            walk.refuse(
+                "texture",
+                "mesh_attribute",
+                key,
+                f'has {values.size} numbers in "{name}" for {count}, expected 1 or 3 each',
+                "is black there",
+            )
+            continue
+        data = walk.add_array(values.reshape(-1, channels))
+        held.append({"name": name, "per": per, "data": data, "channels": channels})
+    if held:
+        entry["attributes"] = held
 
 
 def _mesh(walk: Walk, obj: Any, where: str) -> Entry:

@@ -1,4 +1,4 @@
-"""Textures and spectra: constants and bitmaps.
+"""Textures and spectra: constants, bitmaps, boards, and attributes of meshes.
 
 In the RGB variants Mitsuba turns the emission spectra of a scene file into these before we see them: `d65` becomes
 `uniform`, `srgb` or the bitmap that it nests.
@@ -35,6 +35,14 @@ Texels = NDArray[np.float32]
 BLOCK_ROWS = 64
 """Rows of a bitmap that a search looks at together: enough for numpy, and small beside the bitmap."""
 
+_BYTES = np.arange(256) / 255.0
+
+CURVES = {
+    "linear": _BYTES,
+    "srgb": np.where(_BYTES <= 0.04045, _BYTES / 12.92, ((_BYTES + 0.055) / 1.055) ** 2.4),
+}
+"""What each byte of a bitmap stands for, by its encoding."""
+
 NOTICEABLE = 1e-3
 """Differences below this share of a bitmap's largest value are taken for none when modes are told apart."""
 
@@ -69,13 +77,18 @@ def _bitmap(walk: Walk, obj: Any, _where: str) -> Entry:
         raise RefusedError(f"has data of shape {stored.shape}, expected (height, width, 1 or 3)")
     look_up = _Probe(obj, to_uv, stored.shape)
 
+    encoding = "linear"
     if stored.dtype == np.uint8:
-        texels = _decode(stored, obj, look_up)
+        # Bytes stay bytes, a quarter of the memory; what they stand for is only looked at here.
+        data = np.ascontiguousarray(stored)
+        encoding = _encoding(stored, obj, look_up)
+        texels = CURVES[encoding].astype(np.float32)[stored]
     else:
-        texels = np.ascontiguousarray(stored, np.float32)
+        data = texels = np.ascontiguousarray(stored, np.float32)
     filter_type, wrap = _modes(texels, look_up)
     return {
-        "data": walk.add_array(texels),
+        "data": walk.add_array(data),
+        "encoding": encoding,
         "to_uv": to_uv.ravel().tolist(),
         "wrap": wrap,
         "filter": filter_type,
@@ -93,9 +106,17 @@ def _checkerboard(walk: Walk, obj: Any, where: str) -> Entry:
     return entry
 
 
+def _mesh_attribute(_walk: Walk, obj: Any, _where: str) -> Entry:
+    return {
+        "name": printed(obj).get("name", "").strip('"'),
+        "scale": number(Fields(obj)["scale"], "scale"),
+    }
+
+
 TEXTURES: dict[str, Converter] = {
     "Checkerboard": Converter("checkerboard", "checkerboard", _checkerboard),
     "SRGBReflectanceSpectrum": Converter("srgb", "constant", _constant),
+    "MeshAttribute": Converter("mesh_attribute", "mesh_attribute", _mesh_attribute),
     "UniformSpectrum": Converter("uniform", "constant", _constant),
     "RawConstantTexture": Converter("rawconstant", "constant", _constant),
     "BitmapTextureImpl": Converter("bitmap", "bitmap", _bitmap),
@@ -137,19 +158,15 @@ class _Probe:
         return np.array(self._obj.eval(si))
 
 
-def _decode(stored: NDArray[np.uint8], obj: Any, look_up: _Probe) -> Texels:
-    """Linear values of a bitmap that Mitsuba keeps in bytes and decodes at each look-up, before it filters."""
-    linear = np.arange(256) / 255.0
-    srgb = np.where(linear <= 0.04045, linear / 12.92, ((linear + 0.055) / 1.055) ** 2.4)
-    curve = linear
-    if not switch(printed(obj), "raw", SWITCH):
-        # Bitmaps from memory may be linear without being `raw`. The two curves differ most near .4.
-        y, x, c = np.unravel_index(np.argmin(np.abs(stored.astype(np.int16) - 110)), stored.shape)
-        byte = stored[y, x, c]
-        value = look_up([(x + 0.5, y + 0.5)])[0, c]
-        if abs(value - srgb[byte]) < abs(value - linear[byte]):
-            curve = srgb
-    return curve.astype(np.float32)[stored]
+def _encoding(stored: NDArray[np.uint8], obj: Any, look_up: _Probe) -> str:
+    """What the bytes stand for that Mitsuba keeps and decodes at each look-up, before it filters: a key of `CURVES`."""
+    if switch(printed(obj), "raw", SWITCH):
+        return "linear"
+    # Bitmaps from memory may be linear without being `raw`. The two curves differ most near .4.
+    y, x, c = np.unravel_index(np.argmin(np.abs(stored.astype(np.int16) - 110)), stored.shape)
+    byte = stored[y, x, c]
+    value = look_up([(x + 0.5, y + 0.5)])[0, c]
+    return min(CURVES, key=lambda name: abs(value - CURVES[name][byte]))
 
 
 def _modes(texels: Texels, look_up: _Probe) -> tuple[str, str]:

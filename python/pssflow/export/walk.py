@@ -18,6 +18,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from .approximate import INSTEAD, replacement
 from .names import PLUGIN_NAMES
 
 Entry = dict[str, Any]
@@ -51,6 +52,11 @@ class Unsupported(NamedTuple):
     reason: str | None
     """What about it, where the plugin itself is supported."""
 
+    @property
+    def instead(self) -> str | None:
+        """What `--approximate` would do; None where it cannot help."""
+        return INSTEAD.get(self.kind)
+
     def __str__(self) -> str:
         kind = "plugin" if self.where == self.shape and self.kind == "shape" else self.kind
         owner = "" if self.shape is None else f'shape "{self.shape}": '
@@ -72,7 +78,9 @@ class Converter(NamedTuple):
 class Walk:
     """The state of one export: the entries and arrays so far, and what had to be refused."""
 
-    def __init__(self, names: Mapping[Hashable, str]) -> None:
+    def __init__(self, names: Mapping[Hashable, str], *, approximate: bool = False) -> None:
+        self.approximate = approximate
+        """Whether what is not supported is replaced, with a note, where that can be."""
         self.arrays: list[NDArray[Any]] = []
         self.entries: dict[str, list[Entry]] = defaultdict(list)
         self.counts: dict[str, Counter[str]] = defaultdict(Counter)
@@ -80,12 +88,19 @@ class Walk:
         self.notes: list[str] = []
         self.shape: str | None = None
         """Id of the shape being converted, for messages."""
+        self.bsdfs: Mapping[str, Converter] = {}
+        """The registry of BSDFs, which only their own module knows."""
         self.groups: dict[str, Any] = {}
         """Shapegroups of the scene by name."""
         self.group_indices: dict[str, int] = {}
         """Index of each group that an instance showed so far."""
+        self.suns: list[Any] = []
+        """The sky that each entry of `entries["sun"]` came out of."""
+        self.shutter = (0.0, 0.0)
+        """When the sensor's shutter opens, and for how long."""
         self._names = names
         self._indices: dict[tuple[str, Hashable], int] = {}
+        self._attributes: dict[Hashable, tuple[str, ...]] = {}
 
     def add_array(self, array: NDArray[Any]) -> int:
         """Appends an array and returns its index. Each index is used by one entry: the other side takes arrays over."""
@@ -101,13 +116,11 @@ class Walk:
             return None
         converter = table.get(class_of(obj))
         if converter is None:
-            self.refuse(kind, plugin_of(obj), where)
-            return None
+            return self._replace(kind, plugin_of(obj), obj, where, None, args)
         try:
             entry = converter.convert(self, obj, where, *args)
         except RefusedError as refused:
-            self.refuse(kind, converter.plugin, where, str(refused))
-            return None
+            return self._replace(kind, converter.plugin, obj, where, str(refused), args)
         self.counts[kind][converter.plugin] += 1
         return {"type": converter.type, "id": where, **entry}
 
@@ -124,9 +137,59 @@ class Walk:
         self._indices[kind, obj] = index
         return index
 
-    def refuse(self, kind: str, plugin: str, where: str, reason: str | None = None) -> None:
-        """Notes that something cannot be rendered; the walk goes on, so that all such things are known at its end."""
-        self.unsupported.append(Unsupported(kind, plugin, where, self.shape, reason))
+    def attributes_of(self, obj: Any) -> tuple[str, ...]:
+        """Names of the mesh attributes that an object and its children look up, sorted; found once for each object."""
+        known = self._attributes.get(obj)
+        if known is None:
+            names: set[str] = set()
+            if class_of(obj) == "MeshAttribute":
+                names.add(printed(obj).get("name", "").strip('"'))
+            for child in Fields(obj).children.values():
+                names.update(self.attributes_of(child))
+            known = self._attributes[obj] = tuple(sorted(names))
+        return known
+
+    def refuse(
+        self,
+        kind: str,
+        plugin: str,
+        where: str,
+        reason: str | None = None,
+        instead: str | None = None,
+    ) -> None:
+        """Notes that something cannot be rendered; the walk goes on, so that all such things are known at its end.
+
+        `instead`: what is done in its place where the walk approximates.
+        """
+        thing = Unsupported(kind, plugin, where, self.shape, reason)
+        if self.approximate and instead is not None:
+            self.notes.append(f"approximated: {thing}; it {instead}")
+        else:
+            self.unsupported.append(thing)
+
+    @staticmethod
+    def children(obj: Any) -> dict[str, Any]:
+        """The objects that an object holds, by name."""
+        return Fields(obj).children
+
+    def bsdf(self, obj: Any, where: str) -> int:
+        """Index of a BSDF, converted when first met."""
+        return self.shared(self.bsdfs, "BSDF", obj, where)
+
+    def _replace(
+        self,
+        kind: str,
+        plugin: str,
+        obj: Any,
+        where: str,
+        reason: str | None,
+        args: tuple[Any, ...],
+    ) -> Entry | None:
+        """An entry in the place of one that is not supported, or None, and a line in `unsupported`."""
+        owner = args[1] if kind == "emitter" else None
+        found = replacement(self, kind, obj, where, owner) if self.approximate else None
+        self.refuse(kind, plugin, where, reason, None if found is None else found[1])
+        return None if found is None else {"id": where, **found[0]}
 
 
 class Fields:
@@ -251,6 +314,11 @@ def printed(obj: Any) -> dict[str, str]:
                 pairs.setdefault(name.strip(), value.strip())
             start = i + 1
     return pairs
+
+
+def sampling_weight(obj: Any) -> float:
+    """An emitter's weight when one is chosen."""
+    return number(obj.sampling_weight(), "sampling_weight")
 
 
 SWITCH: Mapping[str, bool] = {"0": False, "1": True, "false": False, "true": True}

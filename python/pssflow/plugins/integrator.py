@@ -20,6 +20,14 @@ Learned light of exactly k bounces (:monosp:`pssflow`)
  * - time
    - |float|
    - Seconds in place of ``spp``, for pilot, fit and rendering. (Default: none; ``spp`` of ``mi.render`` wins)
+ * - hide_emitters
+   - |bool|
+   - Whether camera rays pass through the surfaces of emitters, as in Mitsuba's ``path``. (Default: |false|)
+ * - approximate
+   - |bool|
+   - Whether what is not supported is replaced where there is a replacement: a BSDF by a diffuse one of its mean
+     reflectance, a texture by its mean; media and emitters are left out. ``result.notes`` names each.
+     (Default: |false|)
  * - parametrisation
    - |string|
    - ``bsdf``, ``cosine`` or ``uniform``: what a direction's two numbers mean. (Default: ``bsdf``)
@@ -133,6 +141,7 @@ def define() -> Callable[[Any], Any]:
             self.arguments: dict[str, Any] = given
             self.arguments["threads"] = props.get("threads", 0) or None
             self.progress = bool(props.get("progress", False))
+            self.approximate = bool(props.get("approximate", False))
             self.result: Result | None = None
             # Wrong values are found where the scene is loaded, not when it is rendered.
             self._plan(spp=0, seed=0, sample_count=DEFAULT_SPP)
@@ -154,7 +163,10 @@ def define() -> Callable[[Any], Any]:
                 seed=_scalar(seed),
                 sample_count=camera.sampler().sample_count(),
             )
-            self.result = run(Scene(scene, camera), self.choice, plan, self.progress)
+            ours = Scene(
+                scene, camera, hide_emitters=self.hide_emitters, approximate=self.approximate
+            )
+            self.result = run(ours, self.choice, plan, self.progress)
             _fill(camera.film(), self.result.image)
             return camera.film().develop() if develop else mi.TensorXf()
 

@@ -219,8 +219,10 @@ def _mitsuba(
 ) -> Callable[[], object]:
     """Mitsuba's `path` on the same film; the variant and the size of its thread pool are set before each run."""
     mi.set_variant(variant)
-    scene = Scene(path, scale=scale).mi_scene
-    integrator = mi.load_dict({"type": "path", "max_depth": k + 1, "rr_depth": k + 2})
+    loaded = Scene(path, scale=scale)
+    scene = loaded.mi_scene
+    settings = {"max_depth": k + 1, "rr_depth": k + 2, "hide_emitters": loaded.hide_emitters}
+    integrator = mi.load_dict({"type": "path", **settings})
 
     def run() -> dict[str, float]:
         mi.set_variant(variant)

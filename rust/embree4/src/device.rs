@@ -4,6 +4,7 @@ use std::cell::RefCell;
 use std::ffi::{CString, c_char, c_uint, c_void};
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicIsize, Ordering};
 
 use crate::ffi::{Api, RtcDevice};
 use crate::load::{self, Library};
@@ -102,6 +103,8 @@ pub struct Device(Arc<Handle>);
 struct Handle {
     raw: RtcDevice,
     library: &'static Library,
+    /// Bytes that the device holds; Embree's monitor points here.
+    memory: Box<AtomicIsize>,
 }
 
 // SAFETY: Embree's device functions may be called from any thread, and the handle is released once, by the
@@ -136,6 +139,14 @@ unsafe extern "C" fn record_error(_: *mut c_void, code: c_uint, message: *const 
             });
         }
     });
+}
+
+/// Embree's memory monitor: counts, and always lets it go on.
+unsafe extern "C" fn count_memory(counter: *mut c_void, bytes: isize, _done: bool) -> bool {
+    // SAFETY: the pointer is the counter of the device's `Handle`, which outlives the device.
+    let counter = unsafe { &*counter.cast::<AtomicIsize>() };
+    counter.fetch_add(bytes, Ordering::Relaxed);
+    true
 }
 
 impl Device {
@@ -198,13 +209,31 @@ impl Device {
         unsafe {
             (library.api.set_device_error_function)(raw, Some(record_error), std::ptr::null_mut())
         };
-        Ok(Self(Arc::new(Handle { raw, library })))
+        let memory = Box::new(AtomicIsize::new(0));
+        // SAFETY: `raw` is live; the counter has a fixed address and is freed after the device, see `Handle::drop`.
+        unsafe {
+            (library.api.set_device_memory_monitor_function)(
+                raw,
+                Some(count_memory),
+                std::ptr::from_ref::<AtomicIsize>(&memory).cast_mut().cast(),
+            );
+        }
+        Ok(Self(Arc::new(Handle {
+            raw,
+            library,
+            memory,
+        })))
     }
 
     /// Version of the library: major, minor, patch.
     pub fn version(&self) -> (usize, usize, usize) {
         let version = self.0.library.version;
         (version / 10_000, version / 100 % 100, version % 100)
+    }
+
+    /// Bytes that Embree has allocated on this device and not freed yet: BVHs, not the arrays that it reads in place.
+    pub fn memory(&self) -> usize {
+        usize::try_from(self.0.memory.load(Ordering::Relaxed)).unwrap_or(0)
     }
 
     /// The file that was loaded, as it was named to the system's loader.

@@ -173,6 +173,8 @@ pub(crate) struct RtcQueryFunctionNArguments {
 
 pub(crate) type BoundsFunction = unsafe extern "C" fn(*const RtcBoundsFunctionArguments);
 pub(crate) type QueryFunction = unsafe extern "C" fn(*const RtcQueryFunctionNArguments);
+/// (user pointer, bytes allocated or, negative, freed, whether that happened already) → whether to go on.
+pub(crate) type MemoryMonitorFunction = unsafe extern "C" fn(*mut c_void, isize, bool) -> bool;
 pub(crate) type ErrorFunction = unsafe extern "C" fn(*mut c_void, c_uint, *const c_char);
 
 /// Fails the build where a struct differs from the C declaration.
@@ -235,6 +237,8 @@ function_table! {
     get_device_property = "rtcGetDeviceProperty": fn(RtcDevice, c_uint) -> isize;
     get_device_error = "rtcGetDeviceError": fn(RtcDevice) -> c_uint;
     set_device_error_function = "rtcSetDeviceErrorFunction": fn(RtcDevice, Option<ErrorFunction>, *mut c_void);
+    set_device_memory_monitor_function = "rtcSetDeviceMemoryMonitorFunction":
+        fn(RtcDevice, Option<MemoryMonitorFunction>, *mut c_void);
     new_scene = "rtcNewScene": fn(RtcDevice) -> RtcScene;
     release_scene = "rtcReleaseScene": fn(RtcScene);
     set_scene_flags = "rtcSetSceneFlags": fn(RtcScene, c_uint);
@@ -247,6 +251,8 @@ function_table! {
     commit_geometry = "rtcCommitGeometry": fn(RtcGeometry);
     set_new_geometry_buffer = "rtcSetNewGeometryBuffer":
         fn(RtcGeometry, c_uint, c_uint, c_uint, usize, usize) -> *mut c_void;
+    set_shared_geometry_buffer = "rtcSetSharedGeometryBuffer":
+        fn(RtcGeometry, c_uint, c_uint, c_uint, *const c_void, usize, usize, usize);
     set_geometry_user_primitive_count = "rtcSetGeometryUserPrimitiveCount": fn(RtcGeometry, c_uint);
     set_geometry_user_data = "rtcSetGeometryUserData": fn(RtcGeometry, *mut c_void);
     set_geometry_bounds_function = "rtcSetGeometryBoundsFunction":

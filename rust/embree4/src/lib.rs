@@ -12,6 +12,7 @@ mod query;
 mod ray;
 mod scene;
 mod shapes;
+mod shared;
 
 #[cfg(test)]
 mod guard_tests;
@@ -22,3 +23,4 @@ pub use load::add_search_dirs;
 pub use ray::{Bounds, GeomId, Hit, Ray};
 pub use scene::{PACKET_WIDTH, Scene, SceneBuilder};
 pub use shapes::Quadric;
+pub use shared::Shared;

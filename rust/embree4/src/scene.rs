@@ -6,6 +6,7 @@ use std::sync::Arc;
 use crate::ffi::{self, RtcGeometry, RtcScene};
 use crate::query::{lane, rayhit, rayhit16, rtc_ray, rtc_ray16};
 use crate::shapes::{self, Affine, LARGEST, Prepared};
+use crate::shared::Shared;
 use crate::{Bounds, Device, EmbreeError, GeomId, Hit, Quadric, Ray};
 
 /// Rays in one packet of [`Scene::intersect_packet16`].
@@ -29,6 +30,8 @@ pub struct SceneBuilder {
     robust: bool,
     /// What user pointers of the geometries point to.
     shapes: Vec<Arc<Prepared>>,
+    /// What the buffers of shared meshes point to.
+    meshes: Vec<(Shared<f32>, Shared<u32>)>,
     /// Instanced scenes, kept alive.
     children: Vec<Scene>,
     /// By `GeomId`: world → instance, for the normals of hits; `None` for plain geometry.
@@ -90,6 +93,7 @@ impl SceneBuilder {
             },
             robust: false,
             shapes: Vec::new(),
+            meshes: Vec::new(),
             children: Vec::new(),
             to_instance: Vec::new(),
         })
@@ -154,6 +158,51 @@ impl SceneBuilder {
                     }
                     data.copy_to_nonoverlapping(buffer.cast(), 12 * count);
                 }
+            }
+        }
+        self.attach(&geometry, None)
+    }
+
+    /// Adds a triangle mesh whose arrays Embree reads in place, for as long as the scene lives; layout and errors as
+    /// in [`SceneBuilder::triangles`].
+    ///
+    /// # Errors
+    /// As [`SceneBuilder::triangles`].
+    pub fn shared_triangles(
+        &mut self,
+        positions: &Shared<f32>,
+        faces: &Shared<u32>,
+    ) -> Result<GeomId, EmbreeError> {
+        check_mesh(positions, faces)?;
+        let device = self.handle.device.clone();
+        let geometry = new_geometry(&device, ffi::GEOMETRY_TRIANGLE)?;
+        if !faces.is_empty() {
+            // Before Embree learns of them: they must outlive the scene's handle, which is dropped first.
+            self.meshes.push((positions.clone(), faces.clone()));
+            let set = device.api().set_shared_geometry_buffer;
+            // SAFETY: both arrays hold 12·count bytes and 16 more, which Embree's 16-byte loads of the last element
+            // need; nobody can change or free them while `meshes` holds them, and that outlives the handle.
+            unsafe {
+                set(
+                    geometry.raw,
+                    ffi::BUFFER_VERTEX,
+                    0,
+                    ffi::FORMAT_FLOAT3,
+                    positions.as_ptr().cast(),
+                    0,
+                    12,
+                    positions.len() / 3,
+                );
+                set(
+                    geometry.raw,
+                    ffi::BUFFER_INDEX,
+                    0,
+                    ffi::FORMAT_UINT3,
+                    faces.as_ptr().cast(),
+                    0,
+                    12,
+                    faces.len() / 3,
+                );
             }
         }
         self.attach(&geometry, None)

@@ -4,7 +4,7 @@
 mod common;
 
 use common::{Random, device, everything};
-use embree4::{Device, EmbreeError, Hit, Quadric, Ray, Scene, SceneBuilder};
+use embree4::{Device, EmbreeError, Hit, Quadric, Ray, Scene, SceneBuilder, Shared};
 
 const fn is_send_sync_clone<T: Send + Sync + Clone>() {}
 const _: () = is_send_sync_clone::<Scene>();
@@ -346,4 +346,55 @@ fn bad_instances_are_refused_by_name() {
     );
     let flat = builder.instance(&leaf, &[0.0; 12]).unwrap_err().to_string();
     assert!(flat.starts_with("to_world of the instance"), "{flat}");
+}
+
+/// Meshes that Embree reads in place are hit as copied ones are, also when nobody else holds their arrays any longer,
+/// and the device counts what it allocates itself.
+#[test]
+fn shared_meshes_are_read_in_place() {
+    let device = Device::new().unwrap();
+    // A strip of triangles, so that the last vertex lies at the end of its allocation.
+    let n = 1000u32;
+    let positions: Vec<f32> = (0..n)
+        .flat_map(|i| [(i / 2) as f32 * 0.01, (i % 2) as f32, (i % 7) as f32 * 0.1])
+        .collect();
+    let faces: Vec<u32> = (0..n - 2).flat_map(|i| [i, i + 1, i + 2]).collect();
+    let mut copied = SceneBuilder::new(&device).unwrap();
+    copied.triangles(&positions, &faces).unwrap();
+    let copied = copied.commit().unwrap();
+    let before = device.memory();
+    let shared = {
+        let (positions, faces) = (Shared::from(positions), Shared::from(faces));
+        assert_eq!(
+            (positions.len(), faces.len()),
+            (3 * n as usize, 3 * (n as usize - 2))
+        );
+        let mut builder = SceneBuilder::new(&device).unwrap();
+        builder.shared_triangles(&positions, &faces).unwrap();
+        builder.commit().unwrap()
+    };
+    assert!(device.memory() > before);
+    let mut met = 0;
+    for i in 0..500 {
+        let x = i as f32 * 0.01;
+        let ray = Ray::new([x, 0.37, 5.0], [0.01, 0.0, -1.0]);
+        let (a, b) = (copied.intersect(&ray), shared.intersect(&ray));
+        met += usize::from(a.is_some());
+        assert_eq!(
+            a.map(|h| (h.prim, h.t, h.u, h.v)),
+            b.map(|h| (h.prim, h.t, h.u, h.v))
+        );
+    }
+    assert!(met > 400);
+    drop(shared);
+
+    let mut builder = SceneBuilder::new(&device).unwrap();
+    let corner = Shared::from(vec![0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0]);
+    let refused = builder.shared_triangles(&corner, &Shared::from(vec![0, 1, 3]));
+    assert!(refused.unwrap_err().to_string().contains('3'));
+    assert!(
+        builder
+            .shared_triangles(&corner, &Shared::from(Vec::new()))
+            .is_ok()
+    );
 }

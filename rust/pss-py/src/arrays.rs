@@ -8,7 +8,7 @@ use pyo3::prelude::*;
 
 use crate::errors;
 
-/// A float32 or uint32 array, whatever its shape.
+/// A float32, uint8 or uint32 array, whatever its shape.
 pub(crate) fn any(array: &Bound<'_, PyAny>, index: usize) -> PyResult<Array> {
     if let Ok(a) = array.extract::<PyReadonlyArrayDyn<'_, f32>>() {
         return Ok(Array::F32 {
@@ -22,17 +22,26 @@ pub(crate) fn any(array: &Bound<'_, PyAny>, index: usize) -> PyResult<Array> {
             data: elements(&a),
         });
     }
+    if let Ok(a) = array.extract::<PyReadonlyArrayDyn<'_, u8>>() {
+        return Ok(Array::U8 {
+            shape: a.shape().to_vec(),
+            data: elements(&a),
+        });
+    }
     Err(errors::value(format!(
-        "arrays[{index}] is {}, but must be a numpy array of float32 or uint32",
+        "arrays[{index}] is {}, but must be a numpy array of float32, uint8 or uint32",
         array.get_type()
     )))
 }
 
 fn elements<T: numpy::Element + Copy>(a: &PyReadonlyArrayDyn<'_, T>) -> Vec<T> {
+    // Room for what Embree wants behind an array that it reads in place.
+    let mut owned = Vec::with_capacity(a.len() + 4);
     match a.as_slice() {
-        Ok(slice) => slice.to_vec(),
-        Err(_) => a.as_array().iter().copied().collect(),
+        Ok(slice) => owned.extend_from_slice(slice),
+        Err(_) => owned.extend(a.as_array().iter().copied()),
     }
+    owned
 }
 
 /// Rows of a matrix and their length.

@@ -5,7 +5,8 @@ use std::sync::LazyLock;
 use numpy::{PyReadonlyArray1, PyReadonlyArray2};
 use pss_render::Interaction;
 use pss_render::bsdf::{BsdfSample, Materials, ShadingPoint};
-use pss_render::math::{Frame, Rgb, Vec3};
+use pss_render::math::{Frame, Rgb, Vec2, Vec3};
+use pss_render::texture::TexturePoint;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
@@ -66,6 +67,7 @@ static SURFACE: LazyLock<(Interaction, Frame)> = LazyLock::new(|| {
 fn at(materials: &Materials, uv: [f32; 2]) -> ShadingPoint<'_> {
     ShadingPoint {
         uv: uv.into(),
+        mesh: pss_render::MeshPoint::NOWHERE,
         materials,
         surface: Some((&SURFACE.0, &SURFACE.1)),
     }
@@ -192,8 +194,42 @@ impl Scene {
         let materials = self.inner.materials();
         let texture = materials.texture(index("texture", texture, materials.textures())?);
         let rows = arrays::rows::<2>(&uv, "uv")?;
-        let values: Vec<Rgb> = rows.into_iter().map(|uv| texture.eval(uv.into())).collect();
+        let values: Vec<Rgb> = rows
+            .into_iter()
+            .map(|uv| texture.eval(Vec2::from(uv).into()))
+            .collect();
         arrays::to_rows3(py, &values)
+    }
+
+    /// A texture's colours (n, 3) and scalars (n,) where rays meet surfaces; zero where they meet none.
+    fn texture_eval_at_hits(
+        &self,
+        py: Python<'_>,
+        texture: usize,
+        origins: PyReadonlyArray2<'_, f32>,
+        directions: PyReadonlyArray2<'_, f32>,
+    ) -> PyResult<(Py<PyAny>, Py<PyAny>)> {
+        let materials = self.inner.materials();
+        let texture = materials.texture(index("texture", texture, materials.textures())?);
+        let origins = arrays::rows::<3>(&origins, "origins")?;
+        let directions = arrays::rows::<3>(&directions, "directions")?;
+        arrays::same_rows("directions", directions.len(), origins.len())?;
+        let (colours, scalars): (Vec<Rgb>, Vec<f32>) = origins
+            .iter()
+            .zip(&directions)
+            .map(|(o, d)| {
+                let Some(si) = self.inner.intersect(&embree4::Ray::new(*o, *d)) else {
+                    return (Rgb::ZERO, 0.0);
+                };
+                let mesh = Some((si.mesh_point(), materials.attributes()));
+                let at = TexturePoint { uv: si.uv, mesh };
+                (texture.eval(at), texture.eval_scalar(at))
+            })
+            .unzip();
+        Ok((
+            arrays::to_rows3(py, &colours)?,
+            arrays::to_vector(py, scalars),
+        ))
     }
 
     /// Light drawn from an emitter towards reference points.

@@ -106,13 +106,14 @@ impl Scene {
     fn new(
         py: Python<'_>,
         description: &str,
-        arrays: Vec<Bound<'_, PyAny>>,
+        arrays: &Bound<'_, PyAny>,
         search_dirs: Vec<PathBuf>,
     ) -> PyResult<Self> {
+        // One by one: what an iterator hands over it need not hold any longer.
         let owned = arrays
-            .iter()
+            .try_iter()?
             .enumerate()
-            .map(|(i, a)| arrays::any(a, i))
+            .map(|(i, a)| arrays::any(&a?, i))
             .collect::<PyResult<Vec<_>>>()?;
         let device = device(search_dirs)?;
         let (major, minor, patch) = device.version();
@@ -168,9 +169,19 @@ impl Scene {
     }
 
     /// What `emitter_strategy="auto"` means here, and why.
-    fn auto_strategy(&self) -> (&'static str, &'static str) {
-        let (strategy, reason) = self.inner.auto_strategy();
-        (strategy.name(), reason)
+    #[pyo3(signature = (*, k, parametrisation, threads=0))]
+    fn auto_strategy(
+        &self,
+        py: Python<'_>,
+        k: usize,
+        parametrisation: &str,
+        threads: usize,
+    ) -> PyResult<(&'static str, String, Option<f64>)> {
+        let parametrisation = self::parametrisation(parametrisation)?;
+        let chosen = py
+            .detach(|| pssflow::auto_strategy(&self.inner, k, parametrisation, threads))
+            .map_err(errors::render)?;
+        Ok((chosen.strategy.name(), chosen.reason, chosen.ratio))
     }
 
     /// Traces one path a row of u.

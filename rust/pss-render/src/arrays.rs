@@ -18,6 +18,13 @@ pub enum Array {
         /// Elements.
         data: Vec<f32>,
     },
+    /// Bytes of images.
+    U8 {
+        /// Shape, outermost first.
+        shape: Vec<usize>,
+        /// Elements.
+        data: Vec<u8>,
+    },
     /// 32-bit indices.
     U32 {
         /// Shape, outermost first.
@@ -25,6 +32,28 @@ pub enum Array {
         /// Elements.
         data: Vec<u32>,
     },
+}
+
+impl Array {
+    /// The error of a type that is not `expected`.
+    pub(crate) fn of_another_type(
+        &self,
+        owner: &str,
+        name: &'static str,
+        expected: &str,
+    ) -> SceneError {
+        let found = match self {
+            Self::F32 { .. } => "float32",
+            Self::U8 { .. } => "uint8",
+            Self::U32 { .. } => "uint32",
+        };
+        SceneError::Array {
+            owner: owner.to_owned(),
+            name,
+            found: format!("type {found}"),
+            expected: expected.to_owned(),
+        }
+    }
 }
 
 /// The arrays, each taken out (not copied) by the part that owns it.
@@ -73,12 +102,7 @@ impl Arrays {
     ) -> Result<(Vec<usize>, Vec<f32>), SceneError> {
         match self.take(reference, owner, name)? {
             Array::F32 { shape, data } => Ok((shape, data)),
-            Array::U32 { .. } => Err(SceneError::Array {
-                owner: owner.to_owned(),
-                name,
-                found: "type uint32".to_owned(),
-                expected: "float32".to_owned(),
-            }),
+            other => Err(other.of_another_type(owner, name, "float32")),
         }
     }
 
@@ -107,16 +131,12 @@ impl Arrays {
                 found: format!("shape {shape:?}"),
                 expected: format!("(n, {columns})"),
             }),
-            Array::F32 { .. } => Err(SceneError::Array {
-                owner: owner.to_owned(),
-                name,
-                found: "type float32".to_owned(),
-                expected: "uint32".to_owned(),
-            }),
+            other => Err(other.of_another_type(owner, name, "uint32")),
         }
     }
 
-    fn take(
+    /// Takes an array of any type and shape.
+    pub(crate) fn take(
         &mut self,
         reference: ArrayRef,
         owner: &str,

@@ -33,6 +33,9 @@ pub(crate) struct SceneDescription {
     pub(crate) emitters: Vec<emitter::Description>,
     pub(crate) sensor: sensor::Description,
     pub(crate) film: film::Description,
+    /// Camera rays pass through the surfaces of emitters, as with Mitsuba's option of that name.
+    #[serde(default)]
+    pub(crate) hide_emitters: bool,
 }
 
 /// Shapes in a space of their own.
@@ -53,6 +56,7 @@ pub(crate) fn scene_hash(description: &serde_json::Value, arrays: &[Array]) -> S
         let (tag, shape) = match array {
             Array::F32 { shape, .. } => (0u8, shape),
             Array::U32 { shape, .. } => (1u8, shape),
+            Array::U8 { shape, .. } => (2u8, shape),
         };
         hasher.update(&[tag]);
         for n in shape {
@@ -62,6 +66,7 @@ pub(crate) fn scene_hash(description: &serde_json::Value, arrays: &[Array]) -> S
         let count = match array {
             Array::F32 { data, .. } => data.len(),
             Array::U32 { data, .. } => data.len(),
+            Array::U8 { data, .. } => data.len(),
         };
         for start in (0..count).step_by(1 << 16) {
             let end = (start + (1 << 16)).min(count);
@@ -73,6 +78,7 @@ pub(crate) fn scene_hash(description: &serde_json::Value, arrays: &[Array]) -> S
                 Array::U32 { data, .. } => {
                     words.extend(data[start..end].iter().flat_map(|x| x.to_le_bytes()));
                 }
+                Array::U8 { data, .. } => words.extend_from_slice(&data[start..end]),
             }
             hasher.update(&words);
         }

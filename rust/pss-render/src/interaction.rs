@@ -4,6 +4,26 @@ use glam::Vec2;
 
 use crate::math::{Frame, RAY_EPSILON, SHADOW_EPSILON, Vec3};
 
+/// A place on a triangle of a mesh, for attributes of its vertices and faces.
+#[derive(Clone, Copy, Debug)]
+pub struct MeshPoint {
+    /// Index of the shape.
+    pub shape: u32,
+    /// Index of the triangle.
+    pub prim: u32,
+    /// Weights of its second and third vertex.
+    pub barycentrics: Vec2,
+}
+
+impl MeshPoint {
+    /// A place on no mesh.
+    pub const NOWHERE: Self = Self {
+        shape: u32::MAX,
+        prim: 0,
+        barycentrics: Vec2::ZERO,
+    };
+}
+
 /// Where a ray met a surface.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Interaction {
@@ -21,9 +41,23 @@ pub struct Interaction {
     pub dp_dv: Vec3,
     /// Index of the shape.
     pub shape: u32,
+    /// Index of the triangle; 0 on exact shapes.
+    pub prim: u32,
+    /// Weights of the triangle's second and third vertex.
+    pub barycentrics: Vec2,
 }
 
 impl Interaction {
+    /// Where on which triangle it is.
+    #[inline]
+    pub fn mesh_point(&self) -> MeshPoint {
+        MeshPoint {
+            shape: self.shape,
+            prim: self.prim,
+            barycentrics: self.barycentrics,
+        }
+    }
+
     /// Mitsuba's shading frame, measured along ∂p/∂u.
     pub fn uv_frame(&self) -> Frame {
         Frame::from_tangent(self.shading_normal, self.dp_du)

@@ -33,7 +33,7 @@ pub use description::SCHEMA;
 pub use distribution::Discrete;
 pub use error::{SceneError, TraceError};
 pub use film::{Accumulator, Developed, Film, Tile};
-pub use interaction::Interaction;
+pub use interaction::{Interaction, MeshPoint};
 pub use numbers::{NumberSource, Uniform, VertexContext};
 pub use path::{Parametrisation, Tracer};
 pub use paths::Paths;

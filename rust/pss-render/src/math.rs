@@ -1,5 +1,8 @@
 //! Vectors, colours and tangent frames.
 
+/// Texture coordinates, or a place on a film.
+pub type Vec2 = glam::Vec2;
+
 /// A point or direction in world or local space.
 pub type Vec3 = glam::Vec3A;
 

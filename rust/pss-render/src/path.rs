@@ -218,8 +218,10 @@ impl<'a> Tracer<'a> {
                 .intersect_packet16(&rays[..n], &mut hits[..n], true);
             for (i, hit) in hits[..n].iter().enumerate() {
                 let lane = paths.active[start + i];
+                let state = &mut paths.states[lane as usize];
+                let hit = hit.and_then(|hit| self.scene.behind_emitters(&mut state.ray, hit));
                 if let Some(hit) = hit {
-                    self.arrive(&mut paths.states[lane as usize], hit);
+                    self.arrive(state, &hit);
                     paths.active[kept] = lane;
                     kept += 1;
                 }
@@ -493,6 +495,7 @@ impl<'a> Tracer<'a> {
     {
         ShadingPoint {
             uv: state.si.uv,
+            mesh: state.si.mesh_point(),
             materials: self.scene.materials(),
             surface: Some((&state.si, &state.frame)),
         }

@@ -14,6 +14,7 @@ use crate::film::Film;
 use crate::interaction::Interaction;
 use crate::math::{Rgb, Vec3};
 use crate::sensor::Sensor;
+use crate::shape::attribute::Attributes;
 use crate::shape::{Common, Shape};
 use crate::texture::Texture;
 
@@ -34,6 +35,10 @@ pub struct Summary {
     pub geometry_bytes: usize,
     /// Number of textures.
     pub textures: usize,
+    /// Bytes of their values.
+    pub texture_bytes: usize,
+    /// Bytes that Embree allocated while the scene was built.
+    pub bvh_bytes: usize,
 }
 
 /// A scene that can be traced. Send + Sync; nothing in it changes after it is built.
@@ -51,6 +56,8 @@ pub struct Scene {
     emitter_choice: Discrete,
     sensor: Sensor,
     film: Film,
+    hide_emitters: bool,
+    bvh_bytes: usize,
     hash: String,
 }
 
@@ -155,6 +162,7 @@ impl Scene {
             return Err(SceneError::Empty);
         }
         let (mut shapes, mut commons) = (Vec::new(), Vec::new());
+        let allocated = device.memory();
         let mut builder = embree4::SceneBuilder::new(device)?;
         let mut add = |description, emitters| {
             let (common, shape) = Shape::build(description, &mut arrays)?;
@@ -223,9 +231,13 @@ impl Scene {
             .filter(|&i| emitters[i].model().is_environment())
             .collect();
 
+        let attributes = shapes.iter().map(|s| s.model().attributes());
+        materials.attributes = Attributes::new(attributes.collect());
         let film = Film::build(d.film)?;
+        let accel = builder.commit()?;
         Ok(Self {
-            accel: builder.commit()?,
+            accel,
+            bvh_bytes: device.memory().saturating_sub(allocated),
             shapes,
             commons,
             group_starts,
@@ -236,6 +248,7 @@ impl Scene {
             emitters,
             sensor: Sensor::build(d.sensor, &film)?,
             film,
+            hide_emitters: d.hide_emitters,
             hash,
         })
     }
@@ -292,6 +305,24 @@ impl Scene {
     /// The acceleration structure, for measurements of rays alone.
     pub fn accel(&self) -> &embree4::Scene {
         &self.accel
+    }
+
+    /// The camera's hit, or what lies behind it where it is on an emitter that the camera must not see.
+    #[inline]
+    pub(crate) fn behind_emitters(&self, ray: &mut Ray, hit: Hit) -> Option<Hit> {
+        if !self.hide_emitters {
+            return Some(hit);
+        }
+        let mut hit = hit;
+        loop {
+            let si = self.interaction(ray, &hit);
+            if self.commons[si.shape as usize].emitter.is_none() {
+                return Some(hit);
+            }
+            // As Mitsuba: a ray from that surface on, without the camera's far plane.
+            *ray = si.spawn_ray(Vec3::from_array(ray.dir));
+            hit = self.accel.intersect(ray)?;
+        }
     }
 
     /// The surface at a hit.
@@ -358,12 +389,31 @@ impl Scene {
         )
     }
 
-    /// What the emitter strategy `auto` means for this scene, and why.
-    pub fn auto_strategy(&self) -> (EmitterStrategy, &'static str) {
-        if self.emitters.iter().any(Emitter::can_be_hit) {
-            (EmitterStrategy::Mis, "a ray can hit an emitter")
+    /// The emitter strategy that must be taken here whatever it costs, and why; `None` where both are right.
+    pub fn required_strategy(&self) -> Option<(EmitterStrategy, &'static str)> {
+        let hit = |e: &Emitter| e.can_be_hit();
+        if !self.emitters.iter().any(hit) {
+            return Some((EmitterStrategy::Nee, "no ray can hit an emitter"));
+        }
+        let blind = "emitter samples alone would miss light";
+        let delta = self
+            .materials
+            .bsdfs
+            .iter()
+            .any(|b| b.delta(&self.materials));
+        let missed = |(i, e): (usize, &Emitter)| {
+            e.can_be_hit()
+                && (self.emitter_choice.probability(i) <= 0.0 || !e.model().drawn_everywhere())
+        };
+        if delta {
+            Some((
+                EmitterStrategy::Mis,
+                "a mirror, clear glass or mask is in the scene, and emitter samples alone miss light there",
+            ))
+        } else if self.emitters.iter().enumerate().any(missed) {
+            Some((EmitterStrategy::Mis, blind))
         } else {
-            (EmitterStrategy::Nee, "no ray can hit an emitter")
+            None
         }
     }
 
@@ -383,6 +433,8 @@ impl Scene {
             *s.emitters.entry(e.name().to_owned()).or_default() += 1;
         }
         s.textures = self.materials.textures.len();
+        s.texture_bytes = self.materials.textures.iter().map(Texture::memory).sum();
+        s.bvh_bytes = self.bvh_bytes;
         s
     }
 }

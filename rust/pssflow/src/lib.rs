@@ -16,6 +16,7 @@ pub mod output;
 mod pass;
 mod progress;
 mod statistics;
+mod strategy;
 mod trace;
 
 pub use error::RenderError;
@@ -24,6 +25,7 @@ pub use mixture::Mixture;
 pub use options::{Budget, GuideChoice, Learner, Options, PassKind, PassPlan};
 pub use progress::{Phase, Progress, Silent};
 pub use statistics::{Counts, Statistics};
+pub use strategy::{AutoStrategy, auto_strategy};
 pub use trace::{RayTiming, rays_alone, trace_blocks, uniform_paths};
 
 pub use pss_guide;

@@ -113,4 +113,8 @@ impl BsdfModel for BlendBsdf {
     fn anisotropic(&self, m: &Materials) -> bool {
         self.nested.iter().any(|&b| m.bsdf(b).anisotropic(m))
     }
+
+    fn delta(&self, m: &Materials) -> bool {
+        self.nested.iter().any(|&b| m.bsdf(b).delta(m))
+    }
 }

@@ -104,4 +104,8 @@ impl BsdfModel for BumpMap {
     fn anisotropic(&self, _: &Materials) -> bool {
         true
     }
+
+    fn delta(&self, m: &Materials) -> bool {
+        m.bsdf(self.nested).delta(m)
+    }
 }

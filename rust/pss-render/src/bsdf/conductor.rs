@@ -60,4 +60,8 @@ impl BsdfModel for Conductor {
     fn smooth(&self, _: &Materials) -> bool {
         false
     }
+
+    fn delta(&self, _: &Materials) -> bool {
+        true
+    }
 }

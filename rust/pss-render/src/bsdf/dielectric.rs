@@ -71,4 +71,8 @@ impl BsdfModel for Dielectric {
     fn two_sided(&self, _: &Materials) -> bool {
         true
     }
+
+    fn delta(&self, _: &Materials) -> bool {
+        true
+    }
 }

@@ -16,7 +16,7 @@ pub(super) type Weight = Option<TextureId>;
 pub(super) fn weight(b: &Builder<'_>, texture: TextureId) -> Result<Weight, SceneError> {
     let texture = b.texture(texture)?;
     let is_zero = match b.materials.texture(texture) {
-        constant @ Texture::Constant(_) => constant.eval_scalar(glam::Vec2::ZERO) == 0.0,
+        constant @ Texture::Constant(_) => constant.eval_scalar(glam::Vec2::ZERO.into()) == 0.0,
         _ => false,
     };
     Ok((!is_zero).then_some(texture))

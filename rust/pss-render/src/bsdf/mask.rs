@@ -90,4 +90,8 @@ impl BsdfModel for Mask {
     fn anisotropic(&self, m: &Materials) -> bool {
         m.bsdf(self.nested).anisotropic(m)
     }
+
+    fn delta(&self, _: &Materials) -> bool {
+        true
+    }
 }

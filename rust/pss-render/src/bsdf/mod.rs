@@ -8,9 +8,10 @@ use glam::Vec2;
 use serde::Deserialize;
 
 use crate::error::SceneError;
-use crate::interaction::Interaction;
+use crate::interaction::{Interaction, MeshPoint};
 use crate::math::{Frame, Rgb, Vec3};
-use crate::texture::{Texture, TextureId};
+use crate::shape::attribute::Attributes;
+use crate::texture::{Texture, TextureId, TexturePoint};
 
 mod disney;
 mod fresnel;
@@ -38,6 +39,7 @@ pub struct BsdfSample {
 pub struct Materials {
     pub(crate) bsdfs: Vec<Bsdf>,
     pub(crate) textures: Vec<Texture>,
+    pub(crate) attributes: Attributes,
 }
 
 impl Materials {
@@ -57,6 +59,11 @@ impl Materials {
         self.textures.len()
     }
 
+    /// Attributes of the meshes.
+    pub fn attributes(&self) -> &Attributes {
+        &self.attributes
+    }
+
     /// A texture of the scene.
     #[inline]
     pub fn texture(&self, id: TextureId) -> &Texture {
@@ -69,6 +76,8 @@ impl Materials {
 pub struct ShadingPoint<'a> {
     /// Texture coordinates.
     pub uv: Vec2,
+    /// The place on its triangle, for attributes of meshes.
+    pub mesh: MeshPoint,
     /// Textures and nested BSDFs.
     pub materials: &'a Materials,
     /// The surface and the frame of the local directions, for bump maps; flat where there is none.
@@ -77,13 +86,21 @@ pub struct ShadingPoint<'a> {
 
 impl ShadingPoint<'_> {
     #[inline]
+    fn texture_point(&self) -> TexturePoint<'_> {
+        TexturePoint {
+            uv: self.uv,
+            mesh: Some((self.mesh, &self.materials.attributes)),
+        }
+    }
+
+    #[inline]
     pub(crate) fn rgb(&self, texture: TextureId) -> Rgb {
-        self.materials.textures[texture].eval(self.uv)
+        self.materials.textures[texture].eval(self.texture_point())
     }
 
     #[inline]
     pub(crate) fn scalar(&self, texture: TextureId) -> f32 {
-        self.materials.textures[texture].eval_scalar(self.uv)
+        self.materials.textures[texture].eval_scalar(self.texture_point())
     }
 }
 
@@ -109,7 +126,7 @@ fn alphas_differ(m: &Materials, alpha_u: TextureId, alpha_v: TextureId) -> bool 
     match (m.texture(alpha_u), m.texture(alpha_v)) {
         _ if alpha_u == alpha_v => false,
         (u @ Texture::Constant(_), v @ Texture::Constant(_)) => {
-            u.eval_scalar(Vec2::ZERO) != v.eval_scalar(Vec2::ZERO)
+            u.eval_scalar(Vec2::ZERO.into()) != v.eval_scalar(Vec2::ZERO.into())
         }
         _ => true,
     }
@@ -148,6 +165,11 @@ pub(crate) trait BsdfModel {
     /// Whether any lobe is smooth, so that NEE can join it.
     fn smooth(&self, _materials: &Materials) -> bool {
         true
+    }
+
+    /// Whether any lobe is a delta lobe, which NEE cannot join.
+    fn delta(&self, _materials: &Materials) -> bool {
+        false
     }
 
     /// Whether the azimuth matters, so that Mitsuba's uv frame must be kept.
@@ -271,6 +293,11 @@ macro_rules! registry {
             /// Whether any lobe is smooth, so that NEE can join it.
             pub fn smooth(&self, materials: &Materials) -> bool {
                 match self { $(Self::$variant(b) => b.smooth(materials),)* }
+            }
+
+            /// Whether any lobe is a delta lobe, which NEE cannot join.
+            pub fn delta(&self, materials: &Materials) -> bool {
+                match self { $(Self::$variant(b) => b.delta(materials),)* }
             }
 
             /// Whether the azimuth matters, so that Mitsuba's uv frame is kept.

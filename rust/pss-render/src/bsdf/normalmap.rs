@@ -90,4 +90,8 @@ impl BsdfModel for NormalMap {
     fn anisotropic(&self, _: &Materials) -> bool {
         true
     }
+
+    fn delta(&self, m: &Materials) -> bool {
+        m.bsdf(self.nested).delta(m)
+    }
 }

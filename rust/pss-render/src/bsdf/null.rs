@@ -48,4 +48,8 @@ impl BsdfModel for Null {
     fn two_sided(&self, _: &Materials) -> bool {
         true
     }
+
+    fn delta(&self, _: &Materials) -> bool {
+        true
+    }
 }

@@ -3,7 +3,7 @@
 
 use serde::Deserialize;
 
-use super::{BsdfModel, BsdfSample, Builder, ShadingPoint, delta_lobe, fresnel, reuse};
+use super::{BsdfModel, BsdfSample, Materials, Builder, ShadingPoint, delta_lobe, fresnel, reuse};
 use crate::error::SceneError;
 use crate::math::{Rgb, Vec3};
 use crate::texture::TextureId;
@@ -118,5 +118,9 @@ impl BsdfModel for Plastic {
         let (f_i, p) = self.specular(wi);
         let tint = self.specular_reflectance.map_or(Rgb::ONE, |t| at.rgb(t));
         delta_lobe(Vec3::new(-wi.x, -wi.y, wi.z), tint * (f_i / p), p)
+    }
+
+    fn delta(&self, _: &Materials) -> bool {
+        true
     }
 }

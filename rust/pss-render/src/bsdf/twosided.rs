@@ -96,4 +96,8 @@ impl BsdfModel for TwoSided {
     fn anisotropic(&self, m: &Materials) -> bool {
         self.sides.iter().any(|&s| m.bsdf(s).anisotropic(m))
     }
+
+    fn delta(&self, m: &Materials) -> bool {
+        self.sides.iter().any(|&s| m.bsdf(s).delta(m))
+    }
 }

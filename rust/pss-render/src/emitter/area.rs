@@ -49,7 +49,7 @@ impl EmitterModel for Area {
         Some(EmitterSample {
             d,
             target: Some(s.p),
-            radiance: scene.materials().texture(self.radiance).eval(s.uv),
+            radiance: scene.materials().texture(self.radiance).eval(s.uv.into()),
             pdf: s.pdf,
             delta: false,
         })
@@ -68,7 +68,7 @@ impl EmitterModel for Area {
     fn eval(&self, scene: &Scene, d: Vec3, surface: Option<&Interaction>) -> Rgb {
         match surface {
             Some(si) if d.dot(si.shading_normal) < 0.0 => {
-                scene.materials().texture(self.radiance).eval(si.uv)
+                scene.materials().texture(self.radiance).eval(si.uv.into())
             }
             _ => Rgb::ZERO,
         }

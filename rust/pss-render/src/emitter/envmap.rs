@@ -44,6 +44,7 @@ pub struct Envmap {
     scale: f32,
     rows: Rows,
     map: Affine,
+    mis_compensation: bool,
     /// On a grid whose last column is the first again; `None`: black.
     warp: Option<Hierarchical>,
 }
@@ -73,6 +74,7 @@ impl Envmap {
         Ok(Self {
             warp: warp(&data, width, height, rows, d.mis_compensation),
             rows,
+            mis_compensation: d.mis_compensation,
             map: Affine::new(&d.to_world, &owner)?,
             data,
             width,
@@ -231,6 +233,10 @@ impl EmitterModel for Envmap {
             Some(v) => self.radiance([u_of(d), v]),
             None => Rgb::ZERO,
         }
+    }
+
+    fn drawn_everywhere(&self) -> bool {
+        !self.mis_compensation
     }
 
     fn is_environment(&self) -> bool {

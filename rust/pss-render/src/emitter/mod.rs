@@ -62,6 +62,11 @@ pub(crate) trait EmitterModel {
         true
     }
 
+    /// Whether it is drawn wherever it shines, so that next-event estimation alone finds all of its light.
+    fn drawn_everywhere(&self) -> bool {
+        true
+    }
+
     /// The shape that it sits on.
     fn shape(&self) -> Option<usize> {
         None

@@ -79,7 +79,7 @@ impl EmitterModel for Projector {
         }
         let position = self.map.to_world.translation;
         let d = (position - reference).normalize_or_zero();
-        let irradiance = scene.materials().texture(self.irradiance).eval(uv);
+        let irradiance = scene.materials().texture(self.irradiance).eval(uv.into());
         // Mitsuba's units: π × the image's value is the irradiance of a plane at z = 1, cosine left out.
         let scale = PI * self.scale / (local.z * local.z * -self.axis.dot(d));
         Some(EmitterSample {

@@ -108,7 +108,7 @@ impl EmitterModel for Spot {
         let mut intensity = self.intensity;
         if let Some(texture) = self.texture {
             let slope = Vec2::new(local.x, local.y) / (local.z * self.uv_factor);
-            intensity *= scene.materials().texture(texture).eval(0.5 + 0.5 * slope);
+            intensity *= scene.materials().texture(texture).eval((0.5 + 0.5 * slope).into());
         }
         Some(EmitterSample {
             d,

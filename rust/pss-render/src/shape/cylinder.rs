@@ -74,7 +74,7 @@ impl ShapeModel for Cylinder {
             uv: Self::uv(local),
             dp_du,
             dp_dv: self.map.vector(Vec3::Z),
-            shape: 0,
+            ..Interaction::default()
         }
     }
 

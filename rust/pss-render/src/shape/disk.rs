@@ -72,7 +72,7 @@ impl ShapeModel for Disk {
             uv: Self::uv(local.x, local.y),
             dp_du: self.map.vector(Vec3::new(cos_phi, sin_phi, 0.0)),
             dp_dv: self.map.vector(Vec3::new(-sin_phi, cos_phi, 0.0)) * (TAU * r),
-            shape: 0,
+            ..Interaction::default()
         }
     }
 

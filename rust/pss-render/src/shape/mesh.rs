@@ -2,11 +2,12 @@
 
 use std::sync::Arc;
 
-use embree4::{GeomId, Hit, Ray, SceneBuilder};
+use embree4::{GeomId, Hit, Ray, SceneBuilder, Shared};
 use glam::Vec2;
 use serde::Deserialize;
 
 use super::ShapeModel;
+use super::attribute::{self, Attribute, Loose, Per};
 use crate::bsdf::BsdfId;
 use crate::arrays::{ArrayRef, Arrays};
 use crate::distribution::Discrete;
@@ -25,6 +26,8 @@ pub(crate) struct Description {
     texcoords: Option<ArrayRef>,
     #[serde(default)]
     flip_normals: bool,
+    #[serde(default)]
+    attributes: Vec<attribute::Description>,
     pub(super) bsdf: BsdfId,
     pub(super) emitter: Option<usize>,
 }
@@ -32,8 +35,9 @@ pub(crate) struct Description {
 /// `mesh`: vertices in world space, with optional normals and texture coordinates.
 #[derive(Debug)]
 pub struct Mesh {
-    positions: Arc<[f32]>,
-    faces: Arc<[u32]>,
+    /// Embree reads these two in place.
+    positions: Shared<f32>,
+    faces: Shared<u32>,
     normals: Option<Vec<f32>>,
     texcoords: Option<Vec<f32>>,
     /// Face areas, only where the mesh emits.
@@ -42,6 +46,7 @@ pub struct Mesh {
     /// −1 where the normals are flipped.
     sign: f32,
     degenerate: usize,
+    attributes: Arc<[Attribute]>,
 }
 
 impl Mesh {
@@ -78,7 +83,16 @@ impl Mesh {
             .texcoords
             .map(|a| per_vertex(arrays.take_f32(a, &owner, "texcoords", 2)?, 2, "texcoords"))
             .transpose()?;
-        Ok(Self::new(positions, faces, normals, texcoords, d.flip_normals, d.emitter.is_some()))
+        let attributes = d
+            .attributes
+            .into_iter()
+            .map(|a| {
+                let rows = if a.per == Per::Vertex { vertices } else { faces.len() / 3 };
+                Loose::build(a, arrays, &owner, rows)
+            })
+            .collect::<Result<Vec<_>, _>>()?;
+        let emits = d.emitter.is_some();
+        Ok(Self::new(positions, faces, normals, texcoords, d.flip_normals, emits, attributes))
     }
 
     pub(super) fn new(
@@ -88,6 +102,7 @@ impl Mesh {
         texcoords: Option<Vec<f32>>,
         flip_normals: bool,
         emits: bool,
+        mut attributes: Vec<Loose>,
     ) -> Self {
         let vertex = |i: u32| Vec3::from_slice(&positions[3 * i as usize..][..3]);
         let area = |f: &[u32]| {
@@ -101,17 +116,23 @@ impl Mesh {
             let face = [faces[3 * i], faces[3 * i + 1], faces[3 * i + 2]];
             if area(&face) > 0.0 {
                 faces[3 * kept..3 * kept + 3].copy_from_slice(&face);
+                for a in attributes.iter_mut().filter(|a| a.per == Per::Face) {
+                    a.data.copy_within(i * a.channels..(i + 1) * a.channels, kept * a.channels);
+                }
                 kept += 1;
             }
         }
         faces.truncate(3 * kept);
         let areas = || faces.chunks_exact(3).map(area);
         let total: f64 = areas().map(f64::from).sum();
+        let by_area = emits.then(|| Discrete::new(areas()));
+        let faces = Shared::from(faces);
         Self {
             area: total as f32,
-            by_area: emits.then(|| Discrete::new(areas())),
+            by_area,
             positions: positions.into(),
-            faces: faces.into(),
+            attributes: attributes.into_iter().map(|a| a.on(faces.clone())).collect(),
+            faces,
             normals,
             texcoords,
             sign: if flip_normals { -1.0 } else { 1.0 },
@@ -145,7 +166,7 @@ fn texcoord(texcoords: &[f32], i: usize) -> Vec2 {
 
 impl ShapeModel for Mesh {
     fn attach(&self, builder: &mut SceneBuilder, _groups: &[embree4::Scene]) -> Result<GeomId, SceneError> {
-        Ok(builder.triangles(&*self.positions, &*self.faces)?)
+        Ok(builder.shared_triangles(&self.positions, &self.faces)?)
     }
 
     #[inline]
@@ -184,6 +205,8 @@ impl ShapeModel for Mesh {
             dp_du,
             dp_dv,
             shape: 0,
+            prim: hit.prim,
+            barycentrics: Vec2::new(hit.u, hit.v),
         }
     }
 
@@ -223,11 +246,16 @@ impl ShapeModel for Mesh {
         self.degenerate
     }
 
+    fn attributes(&self) -> Arc<[Attribute]> {
+        Arc::clone(&self.attributes)
+    }
+
     fn memory(&self) -> usize {
         let optional = |a: &Option<Vec<f32>>| a.as_ref().map_or(0, Vec::len);
         4 * (self.positions.len()
             + self.faces.len()
             + optional(&self.normals)
             + optional(&self.texcoords))
+            + self.attributes.iter().map(Attribute::memory).sum::<usize>()
     }
 }

@@ -1,6 +1,8 @@
 //! Shapes: geometry for Embree, shading points, and sampling of their surfaces as Mitsuba does it.
 //! A new one is a file here and a line in the registry below.
 
+use std::sync::Arc;
+
 use embree4::{GeomId, Hit, Ray, SceneBuilder};
 use glam::Vec2;
 use serde::Deserialize;
@@ -10,8 +12,10 @@ use crate::bsdf::BsdfId;
 use crate::error::SceneError;
 use crate::interaction::Interaction;
 use crate::math::Vec3;
+use attribute::Attribute;
 
 pub(crate) mod affine;
+pub(crate) mod attribute;
 
 /// A point drawn on a shape as seen from a reference point.
 #[derive(Clone, Copy, Debug)]
@@ -66,6 +70,11 @@ pub(crate) trait ShapeModel {
     /// Triangles of no area, left out.
     fn degenerate(&self) -> usize {
         0
+    }
+
+    /// Attributes of its vertices and faces.
+    fn attributes(&self) -> Arc<[Attribute]> {
+        Arc::default()
     }
 
     /// Bytes held by its arrays.

@@ -56,6 +56,7 @@ impl Rectangle {
                 Some(texcoords),
                 d.flip_normals,
                 false,
+                Vec::new(),
             ),
         })
     }

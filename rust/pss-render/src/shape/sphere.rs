@@ -118,7 +118,7 @@ impl ShapeModel for Sphere {
             uv: Self::uv(local),
             dp_du: self.map.vector(Vec3::new(-local.y, local.x, 0.0)) * TAU,
             dp_dv: self.map.vector(dp_dv) * PI,
-            shape: 0,
+            ..Interaction::default()
         }
     }
 

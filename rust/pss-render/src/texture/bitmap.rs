@@ -3,8 +3,8 @@
 use glam::Vec2;
 use serde::Deserialize;
 
-use super::TextureModel;
-use crate::arrays::{ArrayRef, Arrays, check_all_finite, check_finite};
+use super::{TextureModel, TexturePoint};
+use crate::arrays::{Array, ArrayRef, Arrays, check_all_finite, check_finite};
 use crate::error::SceneError;
 use crate::math::{Rgb, luminance};
 
@@ -23,6 +23,53 @@ enum Filter {
     Bilinear,
 }
 
+#[derive(Clone, Copy, Debug, Default, Deserialize, PartialEq, Eq)]
+#[serde(rename_all = "lowercase")]
+enum Encoding {
+    #[default]
+    Linear,
+    Srgb,
+}
+
+impl Encoding {
+    /// The value of each byte (IEC 61966-2-1).
+    fn table(self) -> Box<[f32; 256]> {
+        Box::new(std::array::from_fn(|byte| {
+            let x = byte as f64 / 255.0;
+            let linear = match self {
+                Self::Linear => x,
+                Self::Srgb if x <= 0.04045 => x / 12.92,
+                Self::Srgb => ((x + 0.055) / 1.055).powf(2.4),
+            };
+            linear as f32
+        }))
+    }
+}
+
+/// Linear values, or bytes and what each stands for: a quarter of the memory.
+#[derive(Debug)]
+enum Texels {
+    Floats(Vec<f32>),
+    Bytes(Vec<u8>, Box<[f32; 256]>),
+}
+
+impl Texels {
+    #[inline]
+    fn get(&self, i: usize) -> f32 {
+        match self {
+            Self::Floats(v) => v[i],
+            Self::Bytes(v, table) => table[usize::from(v[i])],
+        }
+    }
+
+    fn len(&self) -> usize {
+        match self {
+            Self::Floats(v) => v.len(),
+            Self::Bytes(v, _) => v.len(),
+        }
+    }
+}
+
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Description {
@@ -32,6 +79,9 @@ pub(crate) struct Description {
     to_uv: [f32; 9],
     wrap: Wrap,
     filter: Filter,
+    /// What bytes stand for; floats are linear.
+    #[serde(default)]
+    encoding: Encoding,
     /// Mitsuba's mean of the texture; nothing here needs it yet.
     #[serde(default, rename = "mean")]
     _mean: f32,
@@ -43,7 +93,7 @@ const LARGEST: usize = 1 << 30;
 /// Pixels in rows from v = 0 downwards, as Mitsuba stores them; one or three channels.
 #[derive(Debug)]
 pub struct Bitmap {
-    data: Vec<f32>,
+    data: Texels,
     width: usize,
     height: usize,
     channels: usize,
@@ -56,7 +106,15 @@ pub struct Bitmap {
 impl Bitmap {
     pub(crate) fn build(d: Description, arrays: &mut Arrays) -> Result<Self, SceneError> {
         let owner = format!("texture {:?}", d.id);
-        let (shape, data) = arrays.take_any_f32(d.data, &owner, "data")?;
+        let (shape, data) = match arrays.take(d.data, &owner, "data")? {
+            Array::U8 { shape, data } => (shape, Texels::Bytes(data, d.encoding.table())),
+            Array::F32 { shape, data } => {
+                let channels = shape.last().copied().unwrap_or(1);
+                check_finite(&data, channels.max(1), &owner, "data")?;
+                (shape, Texels::Floats(data))
+            }
+            other => return Err(other.of_another_type(&owner, "data", "float32 or uint8")),
+        };
         let (height, width, channels) = match shape[..] {
             [h, w, c]
                 if (1..=LARGEST).contains(&h)
@@ -75,7 +133,6 @@ impl Bitmap {
                 });
             }
         };
-        check_finite(&data, channels, &owner, "data")?;
         check_all_finite(&d.to_uv, &owner, "to_uv")?;
         let m = d.to_uv;
         Ok(Self {
@@ -105,9 +162,9 @@ impl Bitmap {
     fn texel(&self, x: i32, y: i32) -> Rgb {
         let i = self.wrap(y, self.height) * self.width + self.wrap(x, self.width);
         if self.channels == 3 {
-            Rgb::new(self.data[3 * i], self.data[3 * i + 1], self.data[3 * i + 2])
+            Rgb::new(self.data.get(3 * i), self.data.get(3 * i + 1), self.data.get(3 * i + 2))
         } else {
-            Rgb::splat(self.data[i])
+            Rgb::splat(self.data.get(i))
         }
     }
 }
@@ -118,7 +175,15 @@ fn to_index(x: f32) -> i32 {
 }
 
 impl TextureModel for Bitmap {
-    fn eval(&self, uv: Vec2) -> Rgb {
+    fn memory(&self) -> usize {
+        match &self.data {
+            Texels::Floats(v) => 4 * v.len(),
+            Texels::Bytes(v, table) => v.len() + 4 * table.len(),
+        }
+    }
+
+    fn eval(&self, at: TexturePoint<'_>) -> Rgb {
+        let uv = at.uv;
         let [a, b] = self.to_uv;
         let x = (a[0] * uv.x + a[1] * uv.y + a[2]) * self.width as f32;
         let y = (b[0] * uv.x + b[1] * uv.y + b[2]) * self.height as f32;
@@ -160,8 +225,8 @@ impl TextureModel for Bitmap {
         size * Vec2::new(a[0] * dx + b[0] * dy, a[1] * dx + b[1] * dy)
     }
 
-    fn eval_scalar(&self, uv: Vec2) -> f32 {
-        let value = self.eval(uv);
+    fn eval_scalar(&self, at: TexturePoint<'_>) -> f32 {
+        let value = self.eval(at);
         if self.channels == 1 { value.x } else { luminance(value) }
     }
 }
@@ -174,7 +239,7 @@ mod tests {
     fn indices_wrap_on_both_sides() {
         let wrapped = |wrap| -> Vec<usize> {
             let bitmap = Bitmap {
-                data: vec![0.0; 3],
+                data: Texels::Floats(vec![0.0; 3]),
                 width: 3,
                 height: 1,
                 channels: 1,

@@ -3,7 +3,7 @@
 use glam::Vec2;
 use serde::Deserialize;
 
-use super::{Texture, TextureModel};
+use super::{Texture, TextureModel, TexturePoint};
 use crate::arrays::{Arrays, check_all_finite};
 use crate::error::SceneError;
 use crate::math::Rgb;
@@ -50,12 +50,16 @@ impl Checkerboard {
 }
 
 impl TextureModel for Checkerboard {
-    fn eval(&self, uv: Vec2) -> Rgb {
-        self.colors[usize::from(!self.first(uv))].eval(uv)
+    fn memory(&self) -> usize {
+        self.colors.iter().map(|c| c.memory()).sum()
     }
 
-    fn eval_scalar(&self, uv: Vec2) -> f32 {
+    fn eval(&self, at: TexturePoint<'_>) -> Rgb {
+        self.colors[usize::from(!self.first(at.uv))].eval(at)
+    }
+
+    fn eval_scalar(&self, at: TexturePoint<'_>) -> f32 {
         // Mitsuba 3.9 swaps the two colours where it reads a scalar.
-        self.colors[usize::from(self.first(uv))].eval_scalar(uv)
+        self.colors[usize::from(self.first(at.uv))].eval_scalar(at)
     }
 }

@@ -1,9 +1,8 @@
 //! One colour everywhere (Mitsuba's `srgb`, `uniform` and plain values).
 
-use glam::Vec2;
 use serde::Deserialize;
 
-use super::TextureModel;
+use super::{TextureModel, TexturePoint};
 use crate::arrays::{Arrays, check_all_finite};
 use crate::error::SceneError;
 use crate::math::Rgb;
@@ -36,12 +35,12 @@ impl Constant {
 
 impl TextureModel for Constant {
     #[inline]
-    fn eval(&self, _uv: Vec2) -> Rgb {
+    fn eval(&self, _at: TexturePoint<'_>) -> Rgb {
         self.value
     }
 
     #[inline]
-    fn eval_scalar(&self, _uv: Vec2) -> f32 {
+    fn eval_scalar(&self, _at: TexturePoint<'_>) -> f32 {
         self.scalar
     }
 }

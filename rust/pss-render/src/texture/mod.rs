@@ -5,17 +5,38 @@ use serde::Deserialize;
 
 use crate::arrays::Arrays;
 use crate::error::SceneError;
+use crate::interaction::MeshPoint;
 use crate::math::Rgb;
+use crate::shape::attribute::Attributes;
 
 /// Index into the scene's textures.
 pub type TextureId = usize;
 
+/// Where a texture is looked up.
+#[derive(Clone, Copy, Debug)]
+pub struct TexturePoint<'a> {
+    /// Texture coordinates.
+    pub uv: Vec2,
+    /// The place on its triangle, and the attributes of the scene's meshes; `None` where only uv are known.
+    pub mesh: Option<(MeshPoint, &'a Attributes)>,
+}
+
+impl From<Vec2> for TexturePoint<'_> {
+    fn from(uv: Vec2) -> Self {
+        Self { uv, mesh: None }
+    }
+}
+
 /// What each texture file provides.
 pub(crate) trait TextureModel {
-    /// The colour at `uv`.
-    fn eval(&self, uv: Vec2) -> Rgb;
-    /// The scalar at `uv`: Mitsuba's `eval_1`.
-    fn eval_scalar(&self, uv: Vec2) -> f32;
+    /// The colour.
+    fn eval(&self, at: TexturePoint<'_>) -> Rgb;
+    /// The scalar: Mitsuba's `eval_1`.
+    fn eval_scalar(&self, at: TexturePoint<'_>) -> f32;
+    /// Bytes of its values.
+    fn memory(&self) -> usize {
+        0
+    }
     /// The scalar's gradient over uv: Mitsuba's `eval_1_grad`.
     fn gradient(&self, _uv: Vec2) -> Vec2 {
         Vec2::ZERO
@@ -46,16 +67,21 @@ macro_rules! registry {
                 })
             }
 
-            /// The colour at `uv`.
+            /// The colour.
             #[inline]
-            pub fn eval(&self, uv: Vec2) -> Rgb {
-                match self { $(Self::$variant(t) => t.eval(uv),)* }
+            pub fn eval(&self, at: TexturePoint<'_>) -> Rgb {
+                match self { $(Self::$variant(t) => t.eval(at),)* }
             }
 
-            /// The scalar at `uv` (Mitsuba's `eval_1`).
+            /// The scalar (Mitsuba's `eval_1`).
             #[inline]
-            pub fn eval_scalar(&self, uv: Vec2) -> f32 {
-                match self { $(Self::$variant(t) => t.eval_scalar(uv),)* }
+            pub fn eval_scalar(&self, at: TexturePoint<'_>) -> f32 {
+                match self { $(Self::$variant(t) => t.eval_scalar(at),)* }
+            }
+
+            /// Bytes of its values.
+            pub fn memory(&self) -> usize {
+                match self { $(Self::$variant(t) => t.memory(),)* }
             }
 
             /// The scalar's gradient over uv (Mitsuba's `eval_1_grad`); zero where it has none.
@@ -73,4 +99,5 @@ registry! {
     "constant" => Constant in constant;
     "bitmap" => Bitmap in bitmap;
     "checkerboard" => Checkerboard in checkerboard;
+    "mesh_attribute" => MeshAttribute in mesh_attribute;
 }
