@@ -158,7 +158,7 @@ def reference(
     film = exported.description["film"]["crop_size"]
     if total is None:
         total = _Running.empty(film, max(PATHS_PER_PASS // (film[0] * film[1]), 1))
-    renderer = _Renderer(mi_scene, camera, k)
+    renderer = TruthPass(mi_scene, camera, k)
     saved = time.monotonic()
     with reporting(progress) as listener:
         passes = _more(total, renderer, seed0, limit, target, listener)
@@ -273,8 +273,14 @@ class _Running:
         return metrics.relative_error(self.variance(), self.mean)
 
 
-class _Renderer:
-    """One pass: the difference of two path integrators."""
+class TruthPass:
+    """One pass of the truth, from a seed of its own: the difference of two path integrators.
+
+    Args:
+        scene: an `mi.Scene`.
+        sensor: index of the sensor, or a sensor object.
+        k: bounces.
+    """
 
     def __init__(self, scene: Any, sensor: Any, k: int) -> None:
         self.scene = scene
