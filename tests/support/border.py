@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 import pssflow
 from pssflow import _core
 from pssflow.scene import embree_dirs, load_scene
+from tests.support.meshes import write_octahedron
 from tests.support.mutations import mutate_export, mutate_xml
 
 SCENE = """<scene version="3.0.0">
@@ -60,7 +61,9 @@ SCENE = """<scene version="3.0.0">
     <bsdf type="roughplastic"><float name="alpha" value="0.2"/><boolean name="nonlinear" value="true"/></bsdf>
   </bsdf>
   <bsdf type="bumpmap" id="bumpy">
-    <texture type="bitmap" name="heights"><string name="filename" value="checks.png"/><boolean name="raw" value="true"/></texture>
+    <texture type="bitmap" name="heights">
+      <string name="filename" value="checks.png"/><boolean name="raw" value="true"/>
+    </texture>
     <float name="scale" value="0.1"/>
     <bsdf type="principled"><float name="roughness" value="0.4"/><float name="metallic" value="0.5"/></bsdf>
   </bsdf>
@@ -102,16 +105,7 @@ def write_assets(folder: Path) -> None:
     checks.write(str(folder / "checks.png"))
     sky = rng.random((8, 16, 3)).astype(np.float32)
     mi.Bitmap(sky).write(str(folder / "sky.exr"))
-    points = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
-    faces = [(a, b, c) for a in (0, 1) for b in (2, 3) for c in (4, 5)]
-    header = [
-        *("ply", "format ascii 1.0", f"element vertex {len(points)}"),
-        *(f"property float {axis}" for axis in "xyz"),
-        *(f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"),
-    ]
-    rows = [" ".join(map(str, point)) for point in points]
-    rows += ["3 " + " ".join(map(str, face)) for face in faces]
-    (folder / "ball.ply").write_text("\n".join([*header, *rows]) + "\n", encoding="ascii")
+    write_octahedron(folder / "ball.ply")
 
 
 class Case(NamedTuple):

@@ -62,10 +62,9 @@ MICROFACETS = st.one_of(
     st.fixed_dictionaries({"alpha": ALPHA}),
     st.fixed_dictionaries({"alpha_u": ROUGHNESS, "alpha_v": ROUGHNESS}),
 )
-DISNEY = {
-    name: GREY
-    for name in ("anisotropic", "spec_trans", "sheen", "sheen_tint", "flatness", "spec_tint")
-}
+DISNEY = dict.fromkeys(
+    ("anisotropic", "spec_trans", "sheen", "sheen_tint", "flatness", "spec_tint"), GREY
+)
 
 
 def _with(extra: Strategy, base: Strategy) -> Strategy:

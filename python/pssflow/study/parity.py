@@ -9,7 +9,6 @@ and those that remain are counted (`welch_where_power`).
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -40,18 +39,14 @@ class Plan:
     path: Path
     variant: str = LLVM
     """Mitsuba's, for the truth. LLVM cannot hold thousands of instances."""
-    spp: Mapping[int, int] | int = 256
-    """Of each run, by bounces."""
+    spp: int = 256
+    """Of each of our runs."""
     truth_factor: int = 1
     """The truth's samples for one of ours: in `scalar_rgb` its two depths share no numbers."""
     runs: int = 16
     """Seeds a side to begin with."""
     most_runs: int = 64
     """Seeds a side at most, if tiles are without power."""
-
-    def spp_of(self, k: int) -> int:
-        """Samples a pixel of one of our runs of k-bounce light."""
-        return self.spp if isinstance(self.spp, int) else self.spp[k]
 
 
 SANMIGUEL_CAMERAS = ("", "_cam01", "_cam03", "_cam04", "_cam14", "_cam25")
@@ -62,10 +57,10 @@ def shared_plans(folder: Path) -> list[Plan]:
     plans = [
         Plan(name, folder / name / "scene.xml", spp=spp)
         for name, spp in {
-            "cornell-box": 64,
+            "cornell-box": 256,
             "veach-ajar": 256,
             "veach-bidir": 256,
-            "veach-mis": 256,
+            "veach-mis": 512,
             "staircase2": 256,
             "bathroom2": 256,
             "living-room": 256,
@@ -78,12 +73,17 @@ def shared_plans(folder: Path) -> list[Plan]:
             folder / "sanmiguel" / f"scene{camera}.xml",
             SCALAR,
             spp=32,
-            truth_factor=4,
-            most_runs=16,
+            truth_factor=8,
+            most_runs=32,
         )
         for camera in SANMIGUEL_CAMERAS
     ]
     return [plan for plan in plans if plan.path.is_file()]
+
+
+def own_plans(folder: Path = Path("scenes")) -> list[Plan]:
+    """Those of the project's own scenes."""
+    return [Plan(path.parent.name, path) for path in sorted(folder.glob("*/scene.xml"))]
 
 
 def shared_folder() -> Path | None:
@@ -113,7 +113,9 @@ def truth_runs(scene: Scene, k: int, *, seeds: range, spp: int) -> F64:
         for seed in seeds:
             image, _, bad = truth(seed, spp)
             if bad:
-                raise ValueError(f"{scene.name}: Mitsuba's image holds {bad} values that are not finite")
+                raise ValueError(
+                    f"{scene.name}: Mitsuba's image holds {bad} values that are not finite"
+                )
             images.append(image)
     finally:
         truth.restore()
@@ -134,7 +136,7 @@ def compare_means(scene: Scene, plan: Plan, k: int, *, seed0: int = 0) -> Verdic
     """Welch's test of ours and the truth; the runs are doubled while tiles lack power, up to `plan.most_runs`."""
     ours = truth = np.zeros((0, scene.height, scene.width, 3))
     wanted = plan.runs
-    spp = plan.spp_of(k)
+    spp = plan.spp
     while True:
         more = range(seed0 + len(ours), seed0 + wanted)
         truth = np.concatenate(

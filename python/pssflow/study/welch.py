@@ -179,7 +179,8 @@ def welch_where_power(
     """As `welch`, but each tile must have power: no sample (a pixel of a run) above `HEAVY` of its sum, on either side.
 
     Args:
-        a, b: as of `welch`.
+        a: as of `welch`.
+        b: as of `welch`.
         sizes: sides of tiles in pixels, each a multiple of the one before. A tile without power is tested as part of
             the next larger one, which may overlap its lighter neighbours: Holm's correction needs no independence.
 
@@ -257,6 +258,7 @@ def write_exr(path: Path, values: NDArray[Any]) -> None:
 
 
 def luminance(images: ArrayLike, name: str) -> F64:
+    """Images (runs, height, width) of such or of colours; raises `ValueError` as `welch` does."""
     runs = np.asarray(images, dtype=np.float64)
     if runs.ndim == 4 and runs.shape[3] == 3:
         runs = runs @ LUMINANCE
