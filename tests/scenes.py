@@ -387,8 +387,8 @@ def carved_room() -> Description:
     """Disney's materials, bumps and bent normals on smooth and glossy surfaces, and a leaf with a pattern of holes."""
     T = mi.ScalarTransform4f
     bumps = {"type": "bitmap", "bitmap": mi.Bitmap(_waves()[..., None]), "raw": True}
-    slopes = np.stack(np.gradient(_waves()), -1)
-    normals = np.concatenate([-slopes[..., ::-1], np.ones((*slopes.shape[:2], 1))], axis=2)
+    along_v, along_u = (np.gradient(_waves(), axis=axis) for axis in (0, 1))
+    normals = np.stack([-along_u, -along_v, np.ones_like(along_u)], axis=2)
     normals = 0.5 + 0.5 * normals / np.linalg.norm(normals, axis=2, keepdims=True)
     bent = {"type": "bitmap", "bitmap": mi.Bitmap(normals.astype(np.float32)), "raw": True}
     tiles = mi.ScalarTransform3f().scale([2, 3])

@@ -234,8 +234,8 @@ def _check(scene: mi.Scene, *, arbitrary_tangents: bool = False) -> None:
             # An angle that is 0 on one side and a full turn on the other is the same place.
             a = b + (a - b) - np.round(a - b)
         if name == "sh_s" and arbitrary_tangents:
-            a = a * np.where((a * b).sum(axis=1, keepdims=True) < 0, -1, 1)
-        wrong = same & disagreements(a, b, rel=tolerance, floor=1.0)
+            a = np.where((a * b).sum(axis=1, keepdims=True) < 0, -a, a)
+        wrong = same & disagreements(np.asarray(a, np.float32), b, rel=tolerance, floor=1.0)
         if name == "sh_s" and arbitrary_tangents:
             wrong &= np.abs(theirs["n"][:, 2]) > 1e-4
         if np.count_nonzero(wrong) > 20:

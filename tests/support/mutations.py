@@ -81,10 +81,10 @@ def _mutate_tree(root: ElementTree.Element, rng: random.Random) -> None:
 def mutate_export(
     description: dict[str, Any], arrays: list[NDArray[Any]], seed: int
 ) -> tuple[dict[str, Any], list[Any]]:
-    """Copies of a description and its arrays with one to three wounds."""
+    """Copies of a description and its arrays with one or two wounds."""
     rng = random.Random(seed)
     description, arrays = copy.deepcopy(description), [array.copy() for array in arrays]
-    for _ in range(rng.randint(1, 3)):
+    for _ in range(rng.choice([1, 1, 2])):
         if arrays and rng.random() < 0.4:
             _mutate_arrays(arrays, rng)
         else:
@@ -94,12 +94,11 @@ def mutate_export(
 
 def _mutate_leaf(description: Any, rng: random.Random) -> None:
     """Walks down at random and changes, removes, or adds something there."""
-    node = description
+    node: Any = description
     while True:
         keys = sorted(node) if isinstance(node, dict) else list(range(len(node)))
         if not keys:
-            node_is_list = isinstance(node, list)
-            if node_is_list:
+            if isinstance(node, list):
                 node.append(0)
             else:
                 node["stranger"] = 1
@@ -109,16 +108,20 @@ def _mutate_leaf(description: Any, rng: random.Random) -> None:
         if not isinstance(child, (dict, list)) or rng.random() < 0.1:
             break
         node = child
-    wounds = [-1, 0, 1, 2.5, 1e38, -1e-40, 1e300, 2**32, 2**70, "", "ggx", None, True, [], {}]
-    if isinstance(child, (int, float)) and not isinstance(child, bool):
-        wounds += [-child, child * 1e6, child + 1, child - 1, 0.0, 1e38, -1.0, float("nan")]
-    kind = rng.randrange(6)
+    kind = rng.randrange(12)
+    if isinstance(child, float) and kind > 1:
+        wounds: list[Any] = [-child, child * 1e6, 0.0, -0.0, 0.5, 1.0, -1.0, 1e38, -1e38, 1e-40]
+    elif isinstance(child, int) and not isinstance(child, bool) and kind > 1:
+        wounds = [0, 1, 2, 3, 7, child + 1, child - 1, 1 << 16, (1 << 31) - 1, (1 << 32) - 1]
+    else:
+        wounds = [-1, 0, 2.5, 1e300, 2**70, "", "ggx", None, True, False, [], {}, float("nan")]
     if kind == 0:
         del node[key]
-    elif kind == 1 and isinstance(node, dict):
-        node["stranger"] = child
     elif kind == 1:
-        node.append(copy.deepcopy(child))
+        if isinstance(node, dict):
+            node["stranger"] = child
+        else:
+            node.append(copy.deepcopy(child))
     else:
         node[key] = rng.choice(wounds)
 

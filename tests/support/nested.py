@@ -48,7 +48,7 @@ INDEX = st.lists(st.floats(0.2, 4.0, allow_subnormal=False), min_size=3, max_siz
 )
 
 
-def _plugin(kind: str, needed: dict[str, Strategy] | None = None, **optional: Strategy) -> Strategy:
+def _plugin(kind: str, needed: dict[str, Strategy] | None = None, **optional: Any) -> Strategy:
     """Dictionaries of one plugin: `needed` always, each of `optional` or not."""
     return st.fixed_dictionaries({"type": st.just(kind)} | (needed or {}), optional=optional)
 
@@ -57,7 +57,7 @@ METAL = st.one_of(
     st.fixed_dictionaries({"material": st.sampled_from(["Au", "Cu", "Al", "none"])}),
     st.fixed_dictionaries({"eta": INDEX, "k": INDEX}),
 )
-LOBES = {"specular_reflectance": COLOUR, "specular_transmittance": COLOUR}
+LOBES: dict[str, Any] = {"specular_reflectance": COLOUR, "specular_transmittance": COLOUR}
 MICROFACETS = st.one_of(
     st.fixed_dictionaries({"alpha": ALPHA}),
     st.fixed_dictionaries({"alpha_u": ROUGHNESS, "alpha_v": ROUGHNESS}),
