@@ -92,14 +92,15 @@ def coverage(
             terminal.say(f"{name}, at most {limit:g} s")
             row = _in_a_process(name, folder, settings, limit)
         rows.append({"scene": name} | row)
-    state = {
-        "command": "python -m pssflow.study.coverage " + " ".join(sys.argv[1:]),
-        "before": before,
-        "after": os.getloadavg(),
-        "seconds": time.perf_counter() - start,
-    }
-    text = document(rows, settings | state)
-    write_beside(Path(output), lambda part: part.write_text(text, encoding="utf-8"))
+        state = {
+            "command": " ".join(["python -m pssflow.study.coverage", *sys.argv[1:]]),
+            "before": before,
+            "after": os.getloadavg(),
+            "seconds": time.perf_counter() - start,
+        }
+        # After each scene, so that an interrupted run leaves a table, too.
+        text = document(rows, settings | state)
+        write_beside(Path(output), lambda part, text=text: part.write_text(text, encoding="utf-8"))
     terminal.out.print(f"wrote {output}", highlight=False)
 
 
