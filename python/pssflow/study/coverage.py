@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -142,7 +143,12 @@ def examine(plan: Plan, effort: float, rounds: int, threads: int) -> dict[str, A
     }
     variants = [SCALAR, LLVM] if plan.variant == LLVM else [SCALAR]
     contest = contestants(timed, TIMED_SPP, K, threads, strategies=("mis",), variants=variants)
-    found["speed"] = speeds(contest, threads, rounds)
+    pool = dr.thread_count()
+    try:
+        found["speed"] = speeds(contest, threads, rounds)
+    finally:
+        # Besides being slow, loading an EXR in a pool of one thread can wait for itself in Mitsuba.
+        dr.set_thread_count(pool)
 
     scene = parity.load(plan)
     spp = max(round(plan.spp * effort), 1)
