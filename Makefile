@@ -69,6 +69,10 @@ lint: build $(VENV)/.lint ## rustfmt, clippy, ruff, pyright
 bench: build ## paths per second beside the rays alone and beside Mitsuba
 	$(BIN)/python -m pssflow.study.bench
 
+.PHONY: coverage
+coverage: build ## every scene beside Mitsuba, by mean and by speed: docs/coverage.md
+	$(BIN)/python -m pssflow.study.coverage
+
 .PHONY: docs
 docs: build $(VENV)/.docs ## Rust API into target/doc, Python API into out/docs
 	RUSTDOCFLAGS="-D warnings" cargo doc --workspace --no-deps

@@ -20,6 +20,7 @@ from typing import Any
 
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 Description = dict[str, Any]
 Triple = tuple[float, float, float]
@@ -382,6 +383,110 @@ def glass_room() -> Description:
     }
 
 
+def carved_room() -> Description:
+    """Disney's materials, bumps and bent normals on smooth and glossy surfaces, and a leaf with a pattern of holes."""
+    T = mi.ScalarTransform4f
+    bumps = {"type": "bitmap", "bitmap": mi.Bitmap(_waves()[..., None]), "raw": True}
+    along_v, along_u = (np.gradient(_waves(), axis=axis) for axis in (0, 1))
+    normals = np.stack([-along_u, -along_v, np.ones_like(along_u)], axis=2)
+    normals = 0.5 + 0.5 * normals / np.linalg.norm(normals, axis=2, keepdims=True)
+    bent = {"type": "bitmap", "bitmap": mi.Bitmap(normals.astype(np.float32)), "raw": True}
+    tiles = mi.ScalarTransform3f().scale([2, 3])
+    return {
+        "type": "scene",
+        "camera": _camera(
+            origin=(2.3, -2.8, 1.7), target=(-0.1, 0.2, 0.5), fov=48, film=_film(32, 32, "box")
+        ),
+        "floor": {
+            "type": "rectangle",
+            "to_world": T().scale(2.0),
+            "bsdf": _twosided(
+                {
+                    "type": "normalmap",
+                    "normalmap": bent | {"to_uv": tiles},
+                    "nested": {
+                        "type": "roughplastic",
+                        "alpha": 0.3,
+                        "diffuse_reflectance": _rgb(0.5, 0.4, 0.3),
+                    },
+                }
+            ),
+        },
+        "back": {
+            "type": "rectangle",
+            "to_world": T().translate([0, 2, 1.5]).rotate([1, 0, 0], 90).scale([2, 1.5, 1]),
+            "bsdf": _twosided(
+                {
+                    "type": "bumpmap",
+                    "heights": bumps | {"to_uv": tiles},
+                    "scale": 0.1,
+                    "nested": {
+                        "type": "roughconductor",
+                        "distribution": "ggx",
+                        "alpha_u": 0.5,
+                        "alpha_v": 0.25,
+                        "material": "Cu",
+                    },
+                }
+            ),
+        },
+        "side": {
+            "type": "rectangle",
+            "to_world": T().translate([-2, 0, 1.5]).rotate([0, 1, 0], 90).scale([1.5, 2, 1]),
+            "bsdf": _twosided(
+                {
+                    "type": "principled",
+                    "base_color": _checks(),
+                    "roughness": 0.4,
+                    "metallic": 0.3,
+                    "sheen": 0.5,
+                    "clearcoat": 0.6,
+                    "clearcoat_gloss": 0.3,
+                }
+            ),
+        },
+        "ball": {
+            "type": "sphere",
+            "center": [-0.6, 0.5, 0.55],
+            "radius": 0.5,
+            "bsdf": {
+                "type": "principled",
+                "base_color": _rgb(0.8, 0.7, 0.6),
+                "roughness": 0.5,
+                "spec_trans": 0.6,
+                "eta": 1.4,
+            },
+        },
+        "sheet": {
+            "type": "rectangle",
+            "to_world": T().translate([1.0, -0.1, 0.6]).rotate([0, 1, 0], 70).scale([0.5, 0.6, 1]),
+            "bsdf": {
+                "type": "principledthin",
+                "base_color": _rgb(0.5, 0.7, 0.4),
+                "roughness": 0.5,
+                "spec_trans": 0.3,
+                "diff_trans": 1.2,
+            },
+        },
+        "leaf": {
+            "type": "rectangle",
+            "to_world": T().translate([0, -0.9, 0.6]).rotate([1, 0, 0], 65).scale([0.7, 0.5, 1]),
+            "bsdf": {
+                "type": "mask",
+                "opacity": bumps | {"filter_type": "nearest"},
+                "nested": _twosided(_diffuse(0.3, 0.6, 0.2)),
+            },
+        },
+        "lamp": {
+            "type": "rectangle",
+            "to_world": T().translate([0, 0, 3]).rotate([1, 0, 0], 180).scale(1.2),
+            "bsdf": _diffuse(0.0),
+            "light": _area(3.0, 2.8, 2.5),
+        },
+        "sky": {"type": "constant", "radiance": _rgb(0.4, 0.5, 0.6)},
+    }
+
+
 SCENES: dict[str, Callable[[], Description]] = {
     "quad": quad,
     "furnace_sphere": furnace_sphere,
@@ -389,6 +494,7 @@ SCENES: dict[str, Callable[[], Description]] = {
     "open_sky": open_sky,
     "sun_and_sky": sun_and_sky,
     "glass_room": glass_room,
+    "carved_room": carved_room,
 }
 """Every scene of this file by name; a test over all scenes iterates over this."""
 
@@ -439,6 +545,13 @@ def _area(r: float, g: float | None = None, b: float | None = None) -> Descripti
 
 def _twosided(bsdf: Description) -> Description:
     return {"type": "twosided", "bsdf": bsdf}
+
+
+def _waves() -> NDArray[np.float32]:
+    """Heights (12, 16) between 0 and 1, smooth and periodic."""
+    v, u = np.mgrid[0:12, 0:16]
+    waves = np.sin(2 * np.pi * (u / 16 + v / 12)) * np.cos(4 * np.pi * u / 16)
+    return (0.5 + 0.5 * waves).astype(np.float32)
 
 
 def _checks() -> Description:

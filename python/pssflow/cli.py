@@ -18,6 +18,7 @@ from .files import check_writable, first_line
 from .options import EMITTER_STRATEGIES, PARAMETRISATIONS, PRESETS
 from .params import GuideNames, GuideOption, GuideSetting, Positive, SceneParameter, Size
 from .terminal import Terminal, run_command
+from .thesis import SCENES as THESIS_SCENES
 
 __all__ = ["commands", "main"]
 
@@ -245,6 +246,11 @@ def render(
     help="Seconds for Mitsuba's reference, at most.",
 )
 @click.option(
+    "--thesis",
+    type=click.Choice(tuple(THESIS_SCENES)),
+    help="Print the source thesis' shares of this scene beside those of none and realnvp.",
+)
+@click.option(
     "-o", "--output", default="out/compare", show_default=True, metavar="DIR", help="Folder."
 )
 @click.pass_obj
@@ -255,6 +261,7 @@ def compare(
     output: str,
     reference: str | None,
     reference_time: float,
+    thesis: str | None,
     quiet: bool,
     as_json: bool,
     **options: Any,
@@ -281,12 +288,16 @@ def compare(
             note=terminal.note,
         )
         written = comparison.write(folder)
+    beside = None if thesis is None else THESIS_SCENES[thesis]
     if as_json:
-        terminal.json(comparison.record())
+        told = {} if beside is None else {"thesis": beside.describe()}
+        terminal.json(comparison.record() | told)
     else:
         headline = _headline(scene, comparison.runs[0].stats)
         terminal.out.print(headline, highlight=False, soft_wrap=True)
-        terminal.out.print(report.runs_table(comparison.records()))
+        terminal.out.print(report.runs_table(comparison.records(), beside))
+        if beside is not None:
+            terminal.out.print(f"thesis: {beside.caption}", highlight=False, soft_wrap=True)
         terminal.out.print(comparison.reference_line(), highlight=False, soft_wrap=True)
         names = ", ".join(path.name for path in written)
         terminal.out.print(f"wrote {folder}: {names}", highlight=False, soft_wrap=True)

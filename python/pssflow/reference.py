@@ -164,7 +164,7 @@ def reference(
     film = exported.description["film"]["crop_size"]
     if total is None:
         total = _Running.empty(film, max(PATHS_PER_PASS // (film[0] * film[1]), 1))
-    renderer = _Renderer(mi_scene, camera, k, hide=exported.description["hide_emitters"])
+    renderer = TruthPass(mi_scene, camera, k, hide=exported.description["hide_emitters"])
     saved = time.monotonic()
     with reporting(progress) as listener:
         passes = _more(total, renderer, seed0, limit, target, listener)
@@ -279,8 +279,15 @@ class _Running:
         return metrics.relative_error(self.variance(), self.mean)
 
 
-class _Renderer:
-    """One pass: the difference of two path integrators."""
+class TruthPass:
+    """One pass of the truth, from a seed of its own: the difference of two path integrators.
+
+    Args:
+        scene: an `mi.Scene`.
+        sensor: index of the sensor, or a sensor object.
+        k: bounces.
+        hide: whether emitters are seen through, as Mitsuba's `hide_emitters`.
+    """
 
     def __init__(self, scene: Any, sensor: Any, k: int, *, hide: bool) -> None:
         self.scene = scene

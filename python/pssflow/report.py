@@ -13,6 +13,7 @@ from . import metrics
 from .picture import Panel, Picture, Row, error_map
 from .reference import Reference
 from .render import Result
+from .thesis import ThesisScene
 
 __all__ = [
     "compare_picture",
@@ -34,13 +35,15 @@ PER_ROW = 4
 """Runs side by side in a picture, beside the reference."""
 
 
-def runs_table(runs: Sequence[Mapping[str, Any]]) -> Table:
-    """One row a run; columns that no run can fill are left out."""
+def runs_table(runs: Sequence[Mapping[str, Any]], thesis: ThesisScene | None = None) -> Table:
+    """One row a run; columns that no run can fill are left out. The thesis' share stands beside ours if asked for."""
     shown = Table()
     measured = any(run["relmse"] is not None for run in runs)
     shown.add_column("guide")
     shown.add_column("budget")
     headings = ["a", "s", "camera rays", "found", "non-zero", "share"]
+    if thesis is not None:
+        headings.append(f"thesis, {thesis.title}")
     headings += ["relMSE", "trimmed", "gain"] if measured else ["rel. variance"]
     headings += ["max 1/m", "max f/m ÷ mean"]
     for heading in headings:
@@ -57,6 +60,9 @@ def runs_table(runs: Sequence[Mapping[str, Any]]) -> Table:
             count(run["nonzero"]),
             percent(run["nonzero_share"]),
         ]
+        if thesis is not None:
+            share = thesis.share(run)
+            cells.append("" if share is None else f"{share:.2f} %")
         if measured:
             cells += [number(run["relmse"]), number(run["relmse_trimmed"]), gain(run, runs)]
         else:

@@ -12,6 +12,7 @@ import pytest
 
 from tests.conftest import LLVM
 from tests.support.core import core_scene, our_runs
+from tests.support.meshes import write_octahedron
 from tests.support.runs import truth_runs
 from tests.support.values import F32, first_rows, points, vector3
 from tests.support.welch import ALPHA, welch
@@ -25,17 +26,37 @@ def _turned() -> Any:
     return mi.ScalarTransform4f().rotate([0.6, 0, 0.8], 40).scale([0.9, 0.7, 0.8])
 
 
-SHAPES: dict[str, Callable[[], Description]] = {
-    "rectangle": lambda: {"type": "rectangle", "to_world": _turned()},
-    "disk": lambda: {"type": "disk", "to_world": _turned()},
-    "cylinder": lambda: {
+SHAPES: dict[str, Callable[[Path], Description]] = {
+    "rectangle": lambda _: {"type": "rectangle", "to_world": _turned()},
+    "disk": lambda _: {"type": "disk", "to_world": _turned()},
+    "cylinder": lambda _: {
         "type": "cylinder",
         "radius": 0.5,
         "p0": [0, -0.6, 0],
         "p1": [0.2, 0.5, 0],
     },
-    "sphere": lambda: {"type": "sphere", "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 30)},
-    "cube": lambda: {"type": "cube", "to_world": _turned()},
+    "sphere": lambda _: {
+        "type": "sphere",
+        "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 30),
+    },
+    "cube": lambda _: {"type": "cube", "to_world": _turned()},
+    "mesh-without-uv": lambda folder: {
+        "type": "ply",
+        "filename": str(write_octahedron(folder / "ball.ply")),
+        "to_world": _turned(),
+    },
+    "mesh-of-one-uv": lambda folder: {
+        "type": "ply",
+        "filename": str(write_octahedron(folder / "ball.ply", uv=True)),
+        "to_world": _turned(),
+    },
+    "mesh-of-one-uv-flipped": lambda folder: {
+        "type": "ply",
+        "filename": str(write_octahedron(folder / "ball.ply", uv=True)),
+        "to_world": _turned(),
+        "flip_normals": True,
+        "face_normals": True,
+    },
 }
 
 
@@ -72,14 +93,14 @@ def _rays(rng: np.random.Generator, n: int) -> tuple[F32, F32]:
 
 
 @pytest.mark.parametrize("name", SHAPES)
-def test_derivatives_are_mitsubas(name: str) -> None:
+def test_derivatives_are_mitsubas(name: str, tmp_path: Path) -> None:
     """∂p/∂v at 10,000 rays' hits, to 1e-3 of its length."""
     mi.set_variant(LLVM)
     scene = mi.load_dict(
         {
             "type": "scene",
             "camera": {"type": "perspective"},
-            "shape": SHAPES[name]() | {"bsdf": {"type": "diffuse"}},
+            "shape": SHAPES[name](tmp_path) | {"bsdf": {"type": "diffuse"}},
         }
     )
     core, _ = core_scene(scene)
@@ -100,11 +121,11 @@ def test_derivatives_are_mitsubas(name: str) -> None:
 @pytest.mark.parametrize("name", SHAPES)
 @pytest.mark.stat
 def test_bumped_shapes_have_mitsubas_light(
-    name: str, parametrisation: str, artifacts: Path
+    name: str, parametrisation: str, tmp_path: Path, artifacts: Path
 ) -> None:
     """H0: equal means of one-bounce light (two for the cosine), 12 seeds × 32 spp a side."""
     mi.set_variant(LLVM)
-    scene = _scene(SHAPES[name]())
+    scene = _scene(SHAPES[name](tmp_path))
     k = 1 if parametrisation == "bsdf" else 2
     truth = truth_runs(scene, k=k, seeds=range(12), spp=32)
     ours = our_runs(

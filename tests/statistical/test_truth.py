@@ -37,6 +37,7 @@ SPP = {
     "quad": 16,
     "sun_and_sky": 64,
     "glass_room": 64,
+    "carved_room": 64,
     "instances": 32,
     "courtyard": 256,
     "door-ajar": 1024,
@@ -50,9 +51,9 @@ SHIPPED = ("cornell-box", "teapot")
 """Reduced to 64 × 64 pixels."""
 HARD = ("courtyard", "door-ajar", "glossy", "leaves", "many-lights", "white-room")
 """Shipped as well, reduced to 32 × 32 pixels: each for one reason why light is hard to find, the last for none."""
-SMALL = ("furnace_sphere", "glossy_room", "open_sky", "sun_and_sky", "glass_room")
+SMALL = ("furnace_sphere", "glossy_room", "open_sky", "sun_and_sky", "glass_room", "carved_room")
 """`quad` has a test of its own: its two-bounce light is zero."""
-BLIND = ("glass_room", "leaves")
+BLIND = ("glass_room", "carved_room", "leaves")
 """Scenes where NEE alone misses light, at a mirror or behind a mask say, so that strategy `nee` is not right."""
 
 
@@ -95,6 +96,7 @@ def _cases() -> list[Any]:
         *((name, 2, "bsdf", "nee") for name in (*SHIPPED, "sun_and_sky")),
         *((name, 1, "bsdf", "mis") for name in ("glossy_room", "open_sky", "sun_and_sky")),
         *((name, 3, "bsdf", "mis") for name in ("cornell-box", "furnace_sphere")),
+        ("carved_room", 2, "uniform", "mis"),
         ("glossy_room", 3, "cosine", "nee"),
     }
     cases = []

@@ -11,7 +11,17 @@ from scipy import stats
 
 from tests.conftest import LLVM, ROOT
 from tests.support.runs import Runs, mitsuba_runs
-from tests.support.welch import ALPHA, Moments, holm, luminance, p_value, tile_means, welch
+from tests.support.welch import (
+    ALPHA,
+    HEAVY,
+    Moments,
+    holm,
+    luminance,
+    p_value,
+    tile_means,
+    welch,
+    welch_where_power,
+)
 
 pytestmark = pytest.mark.stat
 
@@ -140,3 +150,47 @@ def test_pictures_are_written(artifacts: Path, scalar_variant: str) -> None:
 def test_welch_refuses_what_would_pass_in_silence(a, b, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         welch(a, b)
+
+
+def _noise(seed: int, runs: int = 16) -> np.ndarray:
+    """Images (runs, 24, 36) of mean 1."""
+    return np.random.default_rng(seed).gamma(2.0, 0.5, (runs, 24, 36))
+
+
+def test_tiles_with_power_are_tested_as_before() -> None:
+    a, b = _noise(1), _noise(2)
+    plain, verdict = welch(a, b, tile=12), welch_where_power(a, b)
+    assert (verdict.tiles, verdict.enlarged, verdict.without_power) == (6, 0, 0)
+    assert verdict.p_holm == pytest.approx(plain.p_holm)
+    assert verdict.p_mean == pytest.approx(plain.p_mean)
+    assert verdict.p > ALPHA
+
+
+def test_a_bias_is_seen_where_there_is_power() -> None:
+    b = _noise(2)
+    b[:, 12:, :12] *= 1.2
+    verdict = welch_where_power(_noise(1), b)
+    assert verdict.p_holm < ALPHA / 2
+    assert "row 1, column 0" in verdict.explain()
+
+
+def test_a_tile_of_one_sample_is_tested_in_a_larger_one() -> None:
+    """A spike above a tenth of its tile's sum, but not of the next larger tile's."""
+    b = _noise(2)
+    share = 2 * HEAVY
+    b[3, 5, 5] = share * 16 * 144
+    verdict = welch_where_power(_noise(1), b)
+    assert (verdict.enlarged, verdict.without_power) == (1, 0)
+    assert verdict.p > ALPHA
+
+
+def test_a_tile_that_stays_heavy_is_counted_not_tested() -> None:
+    """A dark tile with one bright sample is no bias that can be told; the other tiles still are."""
+    a, b = _noise(1), _noise(2)
+    b[3, 5, 5] = 16 * 24 * 36
+    verdict = welch_where_power(a, b, sizes=(12, 24))
+    assert verdict.without_power == 1
+    assert np.isnan(verdict.p_mean)
+    assert verdict.p > ALPHA
+    b[:, 12:, 24:] *= 1.2
+    assert welch_where_power(a, b, sizes=(12, 24)).p < ALPHA / 2

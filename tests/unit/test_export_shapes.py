@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pssflow import _core
 from pssflow.export import UnsupportedError, export
+from pssflow.scene import embree_dirs
 from tests.exports import Description, load, named
 
 
@@ -153,3 +155,18 @@ def test_transforms_of_any_size_pass(variant: str, scale: float) -> None:
         T().translate([100, 200, -300]).rotate([0.6, 0.8, 0], 77).scale([scale, 1, 2 * scale])
     )
     export(load(plate={"type": "disk", "to_world": to_world}))
+
+
+def test_core_names_the_type_of_a_wrong_array(scalar_variant: str) -> None:
+    exported = export(load(floor={"type": "cube"}))
+    arrays = [array.astype(np.float64) for array in exported.arrays]
+    with pytest.raises(ValueError, match=r"arrays\[0\] is an array of float64, but must be a"):
+        _core.Scene(exported.json(), arrays, embree_dirs())
+
+
+def test_shape_without_id_whose_transform_is_not_finite_is_refused(scalar_variant: str) -> None:
+    """By name: shapes without an id are sorted by what they are, and sorting must not stumble over it."""
+    xml = """<scene version="3.0.0"><sensor type="perspective"/><shape type="disk">
+        <transform name="to_world"><scale x="inf"/></transform></shape></scene>"""
+    with pytest.raises(UnsupportedError, match="`to_world` that is not finite"):
+        export(mi.load_string(xml))

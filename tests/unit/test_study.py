@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from pssflow.study.bench import bench
+from pssflow.study.coverage import KINDS, coverage, document
 from pssflow.study.demo import METHODS, THESIS, demo
 from pssflow.terminal import run_command
 
@@ -66,3 +67,37 @@ def test_bench(llvm_variant, tmp_path, capfd):
             assert all(row["paths_per_second"] > 0 for row in rows.values())
             # A path of k = 2 has at most three rays to surfaces and two to emitters.
             assert all(1 <= row["rays_per_path"] <= 5 for row in rows.values())
+
+
+def test_coverage(llvm_variant, tmp_path, monkeypatch, capfd):
+    """One scene's row, its findings kept; the document says its machine, and what was met and what was not."""
+    monkeypatch.chdir(ROOT)
+    monkeypatch.delenv("PSSFLOW_SCENES", raising=False)
+    output, work = tmp_path / "coverage.md", tmp_path / "work"
+    arguments = ["-o", output, "--work", work, "--scenes", "scenes/cornell-box"]
+    arguments += ["--effort", "0.02", "--rounds", "1"]
+    assert run_command(coverage, [str(a) for a in arguments]) == 0, capfd.readouterr().err
+    text = output.read_text()
+    assert "| scenes/cornell-box |" in text
+    assert "3 of 3 comparisons agree" in text
+    for told in ("commit", "cores", "load average", "≥ 1.4", "≥ 3", "target of 3"):
+        assert told in text
+    found = json.loads((work / "scenes-cornell-box.json").read_text())
+    assert found["parity"]["2"]["without_power"] == 0
+    assert found["shares"]["2"] == pytest.approx(0.248, rel=0.05)
+    assert 0 < found["speed"]["over scalar_rgb"] < 100
+    assert run_command(coverage, ["--scenes", "nowhere", "-o", str(output)]) == 2
+    assert "there is no scene 'nowhere'" in capfd.readouterr().err
+
+
+def test_a_scene_that_fails_is_one_row():
+    """Neither the table nor the sums stumble over it, or over what could not be tested."""
+    test = {"p": None, "tiles": 12, "without_power": 12, "ratio": None, "ratio_se": None}
+    row = {"scene": "dark", "triangles": 1, "array_bytes": 1, "peak_bytes": 1, "shares": {}}
+    row |= {"timings": {"load": 0, "export": 0, "bvh": 0}, "parity": dict.fromkeys("123", test)}
+    row |= {"speed": {"ours": 1e6, "rays": 2e6}, "features": {key: {"area": 2} for key in KINDS}}
+    state = {"effort": 1.0, "rounds": 1, "threads": 1, "commit": "abc", "command": "x"}
+    state |= {"before": (0, 0, 0), "after": (0, 0, 0), "seconds": 1.0}
+    text = document([{"scene": "broken", "failed": "not done after 1 s"}, row], state)
+    assert "| broken | **not done after 1 s** |" in text
+    assert "0 of 0 comparisons agree, 3 have no power at all; 36 of 36 tiles have none." in text

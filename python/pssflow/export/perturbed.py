@@ -55,7 +55,9 @@ def switches(bsdf: Any, nested: Any, texture: Any, scale: float | None = None) -
             weight = np.where(agrees, drawn.weight, 0.0)
             if soften:
                 weight = weight * _shadowing(frame[:, 2], wo)[:, None]
-            errors[flip, soften] = float(np.nanmean(np.abs(weight - found.weight)))
+            known = np.isfinite(weight) & np.isfinite(found.weight)
+            difference = np.abs(weight[known] - found.weight[known])
+            errors[flip, soften] = float(difference.mean()) if known.any() else 0.0
     return min(errors, key=lambda s: (round(errors[s], 6), s != DEFAULTS))
 
 

@@ -10,6 +10,7 @@ import re
 from collections import Counter
 from typing import Any
 
+import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
@@ -229,7 +230,9 @@ def _content(shape: Any) -> tuple[str, str, int, bytes, str]:
             blocks.append(rows(shape.faces_buffer(), 1, np.uint32, "faces"))
             blocks.append(rows(shape.vertex_positions_buffer(), 1, np.float32, "vertex_positions"))
         else:
-            blocks.append(np.array(matrix(Fields(shape)["to_world"], "to_world")))
+            # As it is: whether it is finite is asked where the shape is converted, and can be refused.
+            transform = Fields(shape)["to_world"].matrix
+            blocks.append(np.array(dr.detach(transform), np.float64).ravel())
     digest = hashlib.blake2b(digest_size=16)
     for block in blocks:
         digest.update(block.data)

@@ -12,12 +12,13 @@ bounces, ours that of exactly k: rays per second are comparable, paths per secon
 
 from __future__ import annotations
 
+import functools
 import os
 import platform
 import statistics
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,7 @@ from ..variants import llvm_problem
 
 SCENES = ("cornell-box", "teapot")
 SCALAR, LLVM = "scalar_rgb", "llvm_ad_rgb"
+RAYS_ALONE = "mis, its rays alone"
 
 
 SIGNS = {"counted": "", "about": "≈ ", "upper bound": "≤ "}
@@ -82,7 +84,8 @@ def bench(
     try:
         for name in SCENES:
             path = Path(folder) / name / "scene.xml"
-            contests = {n: contestants(path, spp, k, n, scale) for n in (1, 2)}
+            load = loader(path, scale)
+            contests = {n: contestants(load, spp, k, n) for n in (1, 2)}
             measured = measure(contests, rounds)
             rows += [row | {"scene": name} for row in measured]
             console.print(table(name, measured))
@@ -112,10 +115,32 @@ def bench(
     console.print(f"wrote {target}")
 
 
-def contestants(path: Path, spp: int, k: int, threads: int, scale: float) -> list[Contestant]:
-    """All that take turns on one scene."""
-    mi.set_variant(SCALAR)
-    scene = Scene(path, scale=scale)
+Loader = Callable[[str], Scene]
+"""Gives the scene in a variant of Mitsuba, which it sets."""
+
+
+def loader(path: Path, scale: float) -> Loader:
+    """Loads a scene once for each variant."""
+
+    @functools.cache
+    def load(variant: str) -> Scene:
+        mi.set_variant(variant)
+        return Scene(path, scale=scale)
+
+    return load
+
+
+def contestants(
+    load: Loader,
+    spp: int,
+    k: int,
+    threads: int,
+    *,
+    strategies: Sequence[str] = ("mis", "nee"),
+    variants: Sequence[str] = (SCALAR, LLVM),
+) -> list[Contestant]:
+    """All that take turns on one scene: ours with each strategy, its rays alone, Mitsuba in each variant."""
+    scene = load(SCALAR)
     paths = scene.width * scene.height * spp
     alone = scene.core.rays_alone(spp=1, k=k, threads=threads)
     reach = [_reached(scene, bounces) for bounces in range(1, k + 1)]
@@ -135,11 +160,11 @@ def contestants(path: Path, spp: int, k: int, threads: int, scale: float) -> lis
             alone["rays_per_path"] - (reach[-1] if strategy == "nee" else 0.0),
             "counted" if strategy == "mis" else "about",
         )
-        for strategy in ("mis", "nee")
+        for strategy in strategies
     ]
     found.append(
         Contestant(
-            "mis, its rays alone",
+            RAYS_ALONE,
             lambda: scene.core.rays_alone(spp=spp, k=k, threads=threads),
             paths,
             alone["rays_per_path"],
@@ -147,8 +172,10 @@ def contestants(path: Path, spp: int, k: int, threads: int, scale: float) -> lis
         )
     )
     bound = 1 + 2 * sum(reach)
-    for variant in (SCALAR, *(() if llvm_problem() else (LLVM,))):
-        run = _mitsuba(variant, path, spp, k, threads, scale)
+    for variant in variants:
+        if variant == LLVM and llvm_problem():
+            continue
+        run = _mitsuba(load, variant, spp, k, threads)
         found.append(Contestant(f"Mitsuba {variant}", run, paths, bound, "upper bound"))
     return found
 
@@ -214,13 +241,11 @@ def _reached(scene: Scene, bounces: int) -> float:
     return stats["paths_found"] / stats["camera_rays"]
 
 
-def _mitsuba(
-    variant: str, path: Path, spp: int, k: int, threads: int, scale: float
-) -> Callable[[], object]:
+def _mitsuba(load: Loader, variant: str, spp: int, k: int, threads: int) -> Callable[[], object]:
     """Mitsuba's `path` on the same film; the variant and the size of its thread pool are set before each run."""
-    mi.set_variant(variant)
-    loaded = Scene(path, scale=scale)
+    loaded = load(variant)
     scene = loaded.mi_scene
+    mi.set_variant(variant)
     settings = {"max_depth": k + 1, "rr_depth": k + 2, "hide_emitters": loaded.hide_emitters}
     integrator = mi.load_dict({"type": "path", **settings})
 

@@ -26,14 +26,15 @@ from ..render import Result
 from ..report import count, number, panel, percent, reference_panel
 from ..scene import Scene
 from ..terminal import Terminal, run_command
+from ..thesis import SCENES
 
 SCENE = Path("scenes/teapot/scene.xml")
 
 REFERENCE_SECONDS = 40.0
 """On two cores the whole demo is to stay below three minutes."""
 
-THESIS = {"bsdf": (28.27, 52.16), "cosine": (18.87, 46.16), "uniform": (17.73, 40.94)}
-"""Non-zero paths in per cent of the paths found, random and learned: its Table 2."""
+THESIS = SCENES["teapot"].shares
+"""Its Table 2."""
 
 THESIS_RAYS = 1_081_600
 """Camera rays of the same table."""
@@ -130,7 +131,7 @@ def _write(
             "runs": [run.stats | {"method": key[1]} for key, run in runs.items()],
             "thesis": {
                 "camera_rays": THESIS_RAYS,
-                "nonzero_share": {name: [s / 100 for s in both] for name, both in THESIS.items()},
+                "nonzero_share": SCENES["teapot"].describe()["nonzero_share"],
             },
         },
     )

@@ -28,9 +28,12 @@ pub(crate) fn any(array: &Bound<'_, PyAny>, index: usize) -> PyResult<Array> {
             data: elements(&a),
         });
     }
+    let found = match array.getattr("dtype") {
+        Ok(dtype) => format!("an array of {dtype}"),
+        Err(_) => array.get_type().to_string(),
+    };
     Err(errors::value(format!(
-        "arrays[{index}] is {}, but must be a numpy array of float32, uint8 or uint32",
-        array.get_type()
+        "arrays[{index}] is {found}, but must be a numpy array of float32, uint8 or uint32"
     )))
 }
 

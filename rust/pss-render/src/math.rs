@@ -88,6 +88,19 @@ impl Frame {
     }
 }
 
+/// Two unit vectors that make an orthonormal basis with the unit vector `n` (Duff et al. 2017, *Building an Orthonormal
+/// Basis, Revisited*): Mitsuba's `coordinate_system`, its tangents where texture coordinates give none.
+#[inline]
+pub fn coordinate_system(n: Vec3) -> (Vec3, Vec3) {
+    let sign = 1f32.copysign(n.z);
+    let a = -1.0 / (sign + n.z);
+    let b = n.x * n.y * a;
+    (
+        Vec3::new(1.0 + sign * n.x * n.x * a, sign * b, -sign * n.x),
+        Vec3::new(b, sign + n.y * n.y * a, -n.y),
+    )
+}
+
 /// Mirrors `wi` about the microfacet normal `m`.
 #[inline]
 pub fn reflect(wi: Vec3, m: Vec3) -> Vec3 {

@@ -13,7 +13,7 @@ use crate::arrays::{ArrayRef, Arrays};
 use crate::distribution::Discrete;
 use crate::error::SceneError;
 use crate::interaction::Interaction;
-use crate::math::Vec3;
+use crate::math::{Vec3, coordinate_system};
 use crate::warp::square_to_uniform_triangle;
 
 #[derive(Debug, Deserialize)]
@@ -189,7 +189,9 @@ impl ShapeModel for Mesh {
                 let (d1, d2) = (t1 - t0, t2 - t0);
                 let det = d1.perp_dot(d2);
                 let (dp_du, dp_dv) = if det == 0.0 {
-                    (Vec3::ZERO, Vec3::ZERO)
+                    // Coordinates that are all the same, say: Mitsuba takes arbitrary tangents, and these are the
+                    // same, so that bumps and anisotropic lobes are.
+                    coordinate_system(n)
                 } else {
                     ((e1 * d2.y - e2 * d1.y) / det, (e2 * d1.x - e1 * d2.x) / det)
                 };
