@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 import pssflow
 from pssflow import _core
+from pssflow.export import export
 from pssflow.scene import embree_dirs, load_scene
 from tests.support.meshes import write_octahedron
 from tests.support.mutations import mutate_export, mutate_xml
@@ -171,8 +172,9 @@ _WHOLE: dict[Path, tuple[dict[str, Any], list[NDArray[Any]]]] = {}
 def _whole(path: Path) -> tuple[dict[str, Any], list[NDArray[Any]]]:
     if path not in _WHOLE:
         path.write_text(SCENE, encoding="utf-8")
-        export = pssflow.Scene(path).exported
-        _WHOLE[path] = json.loads(export.json()), export.arrays
+        # Not a `Scene`'s export: the core has taken over its arrays.
+        whole = export(mi.load_file(str(path)), 0)
+        _WHOLE[path] = json.loads(whole.json()), whole.arrays
     return _WHOLE[path]
 
 
