@@ -538,7 +538,12 @@ def test_samples_have_mitsubas_mean_weight(name: str, gallery: Gallery) -> None:
         u[:, 2].copy(),
         mi.Point2f(u[:, :2].T.copy()),
     )
-    difference = ours.astype(np.float64) - points(theirs)
+    theirs = points(theirs)
+    # From behind a one-sided surface its `blendbsdf` divides nothing by nothing.
+    lost = ~np.isfinite(theirs).all(axis=1)
+    assert (wi[lost, 2] < 0).all()
+    theirs[lost] = 0
+    difference = ours.astype(np.float64) - theirs
     se = difference.std(axis=0) / np.sqrt(n)
     assert (np.abs(difference.mean(axis=0)) <= 5 * se + 1e-6).all(), (difference.mean(axis=0), se)
 

@@ -189,9 +189,9 @@ impl ShapeModel for Mesh {
                 let (d1, d2) = (t1 - t0, t2 - t0);
                 let det = d1.perp_dot(d2);
                 let (dp_du, dp_dv) = if det == 0.0 {
-                    // Coordinates that are all the same, say: Mitsuba takes arbitrary tangents, and these are the
-                    // same, so that bumps and anisotropic lobes are.
-                    coordinate_system(n)
+                    // Coordinates that are all the same, say: Mitsuba takes arbitrary tangents, of the normal before it
+                    // is flipped. These are the same, so that bumps and anisotropic lobes are.
+                    coordinate_system(n * self.sign)
                 } else {
                     ((e1 * d2.y - e2 * d1.y) / det, (e2 * d1.x - e1 * d2.x) / det)
                 };
