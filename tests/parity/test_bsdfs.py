@@ -538,7 +538,7 @@ def test_samples_have_mitsubas_mean_weight(name: str, gallery: Gallery) -> None:
         u[:, 2].copy(),
         mi.Point2f(u[:, :2].T.copy()),
     )
-    theirs = points(theirs)
+    theirs = np.broadcast_to(points(theirs), ours.shape).copy()
     # From behind a one-sided surface its `blendbsdf` divides nothing by nothing.
     lost = ~np.isfinite(theirs).all(axis=1)
     assert (wi[lost, 2] < 0).all()

@@ -44,7 +44,18 @@ def test_make_help_lists_every_target() -> None:
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     documented = set(re.findall(r"^([a-z-]+):[^\n=]*## ", makefile, flags=re.M))
     assert documented == {
-        *("help", "build", "demo", "test", "test-long", "lint", "bench", "coverage", "docs", "clean")
+        *(
+            "help",
+            "build",
+            "demo",
+            "test",
+            "test-long",
+            "lint",
+            "bench",
+            "coverage",
+            "docs",
+            "clean",
+        )
     }
 
 
