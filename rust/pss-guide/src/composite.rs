@@ -35,27 +35,19 @@ impl Composite {
         for (i, name) in contents.guide.split('+').enumerate() {
             let config = contents.config["factors"][i].take();
             let prefix = format!("{i}.");
-            let mut tensors = Vec::new();
-            contents.tensors.retain_mut(|(name, shape, values)| {
-                let Some(own) = name.strip_prefix(&prefix) else {
-                    return true;
-                };
-                tensors.push((
-                    own.to_owned(),
-                    std::mem::take(shape),
-                    std::mem::take(values),
-                ));
-                false
-            });
+            let tensors = split(&mut contents.tensors, &prefix);
+            let words = split(&mut contents.words, &prefix);
             let spec = registry::find(name).map_err(|e| e.to_string())?;
             factors.push((spec.restore)(Contents {
                 guide: name.to_owned(),
                 config,
                 tensors,
+                words,
             })?);
         }
-        match contents.tensors.first() {
-            Some((name, ..)) => Err(format!("tensor {name:?} belongs to no factor")),
+        let reals = contents.tensors.first().map(|(name, ..)| name);
+        match reals.or(contents.words.first().map(|(name, ..)| name)) {
+            Some(name) => Err(format!("tensor {name:?} belongs to no factor")),
             None => Ok(Box::new(Self::new(factors, dims))),
         }
     }
@@ -115,17 +107,36 @@ impl Guide for Composite {
     }
 
     fn contents(&self) -> Option<Contents> {
-        let (mut configs, mut tensors) = (Vec::new(), Vec::new());
+        let (mut configs, mut tensors, mut words) = (Vec::new(), Vec::new(), Vec::new());
         for (i, factor) in self.factors.iter().enumerate() {
             let own = factor.contents()?;
             configs.push(own.config);
-            let numbered = |(name, shape, values)| (format!("{i}.{name}"), shape, values);
-            tensors.extend(own.tensors.into_iter().map(numbered));
+            tensors.extend(own.tensors.into_iter().map(|t| numbered(i, t)));
+            words.extend(own.words.into_iter().map(|t| numbered(i, t)));
         }
         Some(Contents {
             guide: self.name.clone(),
             config: json!({ "dims": self.dims, "factors": Value::Array(configs) }),
             tensors,
+            words,
         })
     }
+}
+
+type Tensor<T> = (String, Vec<usize>, Vec<T>);
+
+/// Factor `i`'s tensor among those of the composite.
+fn numbered<T>(i: usize, (name, shape, values): Tensor<T>) -> Tensor<T> {
+    (format!("{i}.{name}"), shape, values)
+}
+
+/// Takes out the tensors whose names begin with `prefix`, without it.
+fn split<T>(tensors: &mut Vec<Tensor<T>>, prefix: &str) -> Vec<Tensor<T>> {
+    let (own, rest) = std::mem::take(tensors)
+        .into_iter()
+        .partition(|t| t.0.starts_with(prefix));
+    *tensors = rest;
+    let own: Vec<Tensor<T>> = own;
+    let strip = |(name, shape, values): Tensor<T>| (name[prefix.len()..].to_owned(), shape, values);
+    own.into_iter().map(strip).collect()
 }

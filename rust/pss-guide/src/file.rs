@@ -27,7 +27,7 @@ pub const FORMAT_VERSION: u32 = 1;
 const FORMAT: &str = "pssflow-guide";
 
 /// What a guide puts into its file.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub struct Contents {
     /// Name in the registry; of a composite, the names of its factors joined by `+`.
     pub guide: String,
@@ -35,6 +35,8 @@ pub struct Contents {
     pub config: Value,
     /// Name, shape, values.
     pub tensors: Vec<(String, Vec<usize>, Vec<f32>)>,
+    /// The same for whole numbers.
+    pub words: Vec<(String, Vec<usize>, Vec<u32>)>,
 }
 
 /// Reads a guide that was fitted for `expected`.
@@ -103,15 +105,20 @@ fn checksum(guide: &str, config: &str, tensors: &SafeTensors<'_>, order: &mut [S
 }
 
 fn serialise(contents: &Contents, metadata: HashMap<String, String>) -> Result<Vec<u8>, String> {
-    let bytes: Vec<Vec<u8>> = contents
-        .tensors
-        .iter()
-        .map(|(_, _, v)| v.iter().flat_map(|x| x.to_le_bytes()).collect())
-        .collect();
-    let mut views = Vec::with_capacity(bytes.len());
-    for ((name, shape, _), bytes) in contents.tensors.iter().zip(&bytes) {
-        let view = TensorView::new(Dtype::F32, shape.clone(), bytes).map_err(|e| e.to_string())?;
-        views.push((name.as_str(), view));
+    type Raw<'a> = (&'a str, &'a [usize], Dtype, Vec<u8>);
+    let reals = contents.tensors.iter().map(|(name, shape, v)| -> Raw<'_> {
+        let bytes = v.iter().flat_map(|x| x.to_le_bytes()).collect();
+        (name, shape, Dtype::F32, bytes)
+    });
+    let words = contents.words.iter().map(|(name, shape, v)| -> Raw<'_> {
+        let bytes = v.iter().flat_map(|x| x.to_le_bytes()).collect();
+        (name, shape, Dtype::U32, bytes)
+    });
+    let raw: Vec<Raw<'_>> = reals.chain(words).collect();
+    let mut views = Vec::with_capacity(raw.len());
+    for (name, shape, dtype, bytes) in &raw {
+        let view = TensorView::new(*dtype, shape.to_vec(), bytes).map_err(|e| e.to_string())?;
+        views.push((*name, view));
     }
     safetensors::serialize(views, Some(metadata)).map_err(|e| e.to_string())
 }
@@ -134,7 +141,7 @@ pub(crate) fn write(path: &Path, header: &Header, contents: &Contents) -> Result
     ]);
     let plain = serialise(contents, metadata.clone()).map_err(other)?;
     let tensors = SafeTensors::deserialize(&plain).map_err(|e| other(e.to_string()))?;
-    let mut names: Vec<String> = contents.tensors.iter().map(|t| t.0.clone()).collect();
+    let mut names: Vec<String> = tensors.names().into_iter().map(str::to_owned).collect();
     metadata.insert(
         "blake3".to_owned(),
         checksum(&contents.guide, &config, &tensors, &mut names),
@@ -196,38 +203,43 @@ fn read(path: &Path) -> Result<(Header, Contents), GuideError> {
     }
     let config = serde_json::from_str(&config)
         .map_err(|e| corrupt(format!("its configuration is not JSON: {e}")))?;
-    let mut list = Vec::with_capacity(names.len());
+    let mut contents = Contents {
+        guide,
+        config,
+        ..Contents::default()
+    };
     for name in names {
         let tensor = tensors.tensor(&name).map_err(|e| corrupt(e.to_string()))?;
-        if tensor.dtype() != Dtype::F32 {
-            return Err(corrupt(format!(
-                "tensor {name:?} is {:?}, not F32",
-                tensor.dtype()
-            )));
+        let shape = tensor.shape().to_vec();
+        let (values, _) = tensor.data().as_chunks::<4>();
+        match tensor.dtype() {
+            Dtype::F32 => {
+                let values = values.iter().map(|&w| f32::from_le_bytes(w)).collect();
+                contents.tensors.push((name, shape, values));
+            }
+            Dtype::U32 => {
+                let values = values.iter().map(|&w| u32::from_le_bytes(w)).collect();
+                contents.words.push((name, shape, values));
+            }
+            other => {
+                return Err(corrupt(format!(
+                    "tensor {name:?} is {other:?}, not F32 or U32"
+                )));
+            }
         }
-        let (words, _) = tensor.data().as_chunks::<4>();
-        let values = words.iter().map(|&w| f32::from_le_bytes(w)).collect();
-        list.push((name, tensor.shape().to_vec(), values));
     }
     let header = Header {
         columns_hash: field("columns_hash")?,
         scene_hash: field("scene_hash")?,
     };
-    Ok((
-        header,
-        Contents {
-            guide,
-            config,
-            tensors: list,
-        },
-    ))
+    Ok((header, contents))
 }
 
 /// The values of `tensors` in the order of `wanted`; names and shapes must agree exactly.
-pub(crate) fn take(
-    tensors: Vec<(String, Vec<usize>, Vec<f32>)>,
+pub(crate) fn take<T>(
+    tensors: Vec<(String, Vec<usize>, Vec<T>)>,
     wanted: &[(String, Vec<usize>)],
-) -> Result<Vec<Vec<f32>>, String> {
+) -> Result<Vec<Vec<T>>, String> {
     if tensors.len() != wanted.len() {
         return Err(format!(
             "it holds {} tensors, its configuration asks for {}",
@@ -235,7 +247,7 @@ pub(crate) fn take(
             wanted.len()
         ));
     }
-    let mut by_name: HashMap<String, (Vec<usize>, Vec<f32>)> = tensors
+    let mut by_name: HashMap<String, (Vec<usize>, Vec<T>)> = tensors
         .into_iter()
         .map(|(name, shape, values)| (name, (shape, values)))
         .collect();

@@ -20,9 +20,12 @@ mod file;
 mod flow;
 mod normal;
 mod options;
+mod predict;
 mod recipe;
 mod records;
 mod registry;
+mod select;
+mod table;
 
 use std::path::Path;
 
@@ -34,6 +37,8 @@ pub use flow::options::{Prior, RealNvpOptions};
 pub use recipe::{ALIASES, Recipe};
 pub use records::{Emitter, Records};
 pub use registry::{FitFn, GuideSpec, find, fit, registry};
+pub use select::{CandidateReport, Remaining, Selection, candidates, recall, select};
+pub use table::options::{EmitterTableOptions, TableOptions};
 
 /// What a number of a path decides; a guide models some of these.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]

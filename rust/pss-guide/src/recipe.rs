@@ -4,6 +4,7 @@ use serde_json::{Map, Value};
 
 use crate::composite::Composite;
 use crate::registry::{self, GuideSpec};
+use crate::select::is_idle;
 use crate::{Decision, Fit, Guide, GuideError, Records};
 
 /// Names that stand for a composite.
@@ -80,6 +81,26 @@ impl Recipe {
         self.factors.iter().map(each).sum()
     }
 
+    /// The largest of its factors' shares of uniform paths.
+    pub fn uniform_fraction(&self) -> f32 {
+        self.specs().map(|s| s.uniform_fraction).fold(0.0, f32::max)
+    }
+
+    /// Whether all its factors may be fitted again and again; see [`GuideSpec::refine`].
+    pub fn refines(&self) -> bool {
+        self.specs().all(|s| s.refine)
+    }
+
+    /// Whether any of its factors wants to know where a path is.
+    pub fn looks_at_contexts(&self) -> bool {
+        self.specs().any(|s| s.models != [Decision::Path])
+    }
+
+    /// What its factors together add to the cost of a path; see [`GuideSpec::cost_ratio`].
+    pub fn cost_ratio(&self) -> f64 {
+        self.specs().map(|s| s.cost_ratio).sum()
+    }
+
     /// Fits the factors one after the other, each to what those before it leave: paths count with f²/g of the
     /// density that they would have had in a mixture with the factors so far.
     ///
@@ -95,20 +116,7 @@ impl Recipe {
             return (spec.fit)(options, records, seed, progress);
         }
         let start = std::time::Instant::now();
-        let (mut g, mut fitted) = (records.g.to_vec(), Vec::<Fit>::new());
-        let mut q = vec![1.0f32; records.f.len()];
-        for (i, (spec, options)) in self.factors.iter().enumerate() {
-            let seen = Records { g: &g, ..*records };
-            let share = |done: f32| (i as f32 + done) / self.factors.len() as f32;
-            let fit = (spec.fit)(options, &seen, seed, &mut |done| progress(share(done)))?;
-            if i + 1 < self.factors.len() {
-                records.multiply_densities(&*fit.guide, &mut q);
-                for ((g, &drawn), &q) in g.iter_mut().zip(records.g).zip(&q) {
-                    *g = drawn * (DEFENSIVE + (1.0 - DEFENSIVE) * q);
-                }
-            }
-            fitted.push(fit);
-        }
+        let fitted = self.fit_factors(records, seed, progress)?;
         Ok(Fit {
             history: Vec::new(),
             seconds: start.elapsed().as_secs_f64(),
@@ -128,6 +136,71 @@ impl Recipe {
                 records.dims,
             )),
         })
+    }
+
+    /// Fits the factors one after the other; see [`Recipe::fit`].
+    pub(crate) fn fit_factors(
+        &self,
+        records: &Records<'_>,
+        seed: u64,
+        progress: &mut dyn FnMut(f32) -> bool,
+    ) -> Result<Vec<Fit>, GuideError> {
+        let (mut g, mut fitted) = (records.g.to_vec(), Vec::<Fit>::new());
+        let mut q = vec![1.0f32; records.f.len()];
+        for (i, (spec, options)) in self.factors.iter().enumerate() {
+            let seen = Records { g: &g, ..*records };
+            let share = |done: f32| (i as f32 + done) / self.factors.len() as f32;
+            let fit = (spec.fit)(options, &seen, seed, &mut |done| progress(share(done)))?;
+            if i + 1 < self.factors.len() {
+                records.multiply_densities(&*fit.guide, &mut q);
+                for ((g, &drawn), &q) in g.iter_mut().zip(records.g).zip(&q) {
+                    *g = drawn * (DEFENSIVE + (1.0 - DEFENSIVE) * q);
+                }
+            }
+            fitted.push(fit);
+        }
+        Ok(fitted)
+    }
+
+    /// Some of the factors, in order.
+    pub(crate) fn subset(&self, factors: &[usize]) -> Self {
+        let factors: Vec<_> = factors.iter().map(|&i| self.factors[i].clone()).collect();
+        let names: Vec<&str> = factors.iter().map(|(spec, _)| spec.name).collect();
+        Self {
+            name: names.join("+"),
+            factors,
+        }
+    }
+
+    /// All subsets of the factors but the empty one.
+    pub(crate) fn subsets(&self) -> impl Iterator<Item = Self> + '_ {
+        let n = self.factors.len();
+        (1..1usize << n).map(move |set| {
+            let factors: Vec<usize> = (0..n).filter(|i| set >> i & 1 == 1).collect();
+            self.subset(&factors)
+        })
+    }
+
+    /// The factors that have something to decide in the paths' scene; `None` if none has.
+    pub(crate) fn without_idle(&self, records: &Records<'_>) -> Option<Self> {
+        let busy = |i: &usize| !is_idle(self.factors[*i].0.models, records);
+        let factors: Vec<usize> = (0..self.factors.len()).filter(busy).collect();
+        (!factors.is_empty()).then(|| self.subset(&factors))
+    }
+
+    /// The name, with the options that were set.
+    pub fn label(&self) -> String {
+        let mut set: Vec<String> = self
+            .factors
+            .iter()
+            .flat_map(|(_, options)| options.iter().map(|(k, v)| format!("{k}={v}")))
+            .collect();
+        set.dedup();
+        if set.is_empty() {
+            self.name.clone()
+        } else {
+            format!("{} ({})", self.name, set.join(", "))
+        }
     }
 }
 

@@ -28,7 +28,8 @@ pub struct Emitter {
 /// | `contexts` | `(n, k)` or 0 | x₁ … x_k; the last one's `emitter` is the one chosen                        |
 /// | `pixel`    | `n` or 0   | film position in [0, 1)²                                                       |
 ///
-/// Only non-zero paths need be given: zeros carry no gradient and are counted in `zeros`. `Default` has no path.
+/// Only non-zero paths need be given: zeros carry no gradient and are counted in `zeros`, so that the mean of f is
+/// Σ f/g ÷ (n + zeros). `Default` has no path.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Records<'a> {
     /// Numbers per path.
@@ -51,8 +52,34 @@ pub struct Records<'a> {
     pub pixel: &'a [[f32; 2]],
     /// The scene's emitters in the order of the emitter's number (or none: one, of area).
     pub emitters: &'a [Emitter],
-    /// Paths without light, not given; with thinned records, as many as that share of them.
+    /// Paths drawn that are not given: those without light, and those that thinning left out.
     pub zeros: u64,
+}
+
+/// One path's luminances and the densities of the numbers that each term uses.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Terms {
+    pub(crate) f_nee: f64,
+    pub(crate) f_bsdf: f64,
+    pub(crate) g: f64,
+    pub(crate) g_bsdf: f64,
+}
+
+impl Terms {
+    /// Estimate of ∫f_nee² over all numbers.
+    pub(crate) fn nee_square(&self) -> f64 {
+        self.f_nee * self.f_nee / self.g
+    }
+
+    /// Estimate of ∫(2 f_nee f_bsdf + f_bsdf²). The product needs all numbers, the square the directions' alone.
+    pub(crate) fn bsdf_square(&self) -> f64 {
+        2.0 * self.f_nee * self.f_bsdf / self.g + self.f_bsdf * self.f_bsdf / self.g_bsdf
+    }
+
+    /// Estimate of ∫f.
+    pub(crate) fn value(&self) -> f64 {
+        self.f_nee / self.g + self.f_bsdf / self.g_bsdf
+    }
 }
 
 /// Rows that survive cleaning.
@@ -74,8 +101,33 @@ impl Records<'_> {
         self.dims.saturating_sub(1) / 2
     }
 
+    /// A row's terms: f_nee, f_bsdf, and the densities that belong to them.
+    pub(crate) fn terms(&self, row: usize) -> Terms {
+        let f_bsdf = self.f_bsdf.get(row).map_or(0.0, |&f| f64::from(f).max(0.0));
+        Terms {
+            f_nee: (f64::from(self.f[row]) - f_bsdf).max(0.0),
+            f_bsdf,
+            g: f64::from(self.g[row]),
+            g_bsdf: f64::from(*self.g_bsdf.get(row).unwrap_or(&self.g[row])),
+        }
+    }
+
+    /// A path's vertex, counted from 0; the default where no vertices are known.
+    pub(crate) fn context(&self, row: usize, vertex: usize) -> Context {
+        let at = row * self.bounces() + vertex;
+        self.contexts.get(at).copied().unwrap_or_default()
+    }
+
+    /// Paths drawn, those without light among them.
+    pub(crate) fn paths(&self) -> f64 {
+        self.f.len() as f64 + self.zeros as f64
+    }
+
     /// The columns of a decision, for each vertex where it is taken.
-    fn columns(&self, decision: Decision) -> impl Iterator<Item = (usize, Range<usize>)> + use<> {
+    pub(crate) fn columns(
+        &self,
+        decision: Decision,
+    ) -> impl Iterator<Item = (usize, Range<usize>)> + use<> {
         let k = self.bounces();
         let (vertices, width) = match decision {
             Decision::Path => (0..1, self.dims),
@@ -92,29 +144,33 @@ impl Records<'_> {
 
     /// Multiplies into `q` the guide's density of each path, decision by decision.
     pub(crate) fn multiply_densities(&self, guide: &dyn Guide, q: &mut [f32]) {
+        for &decision in guide.models() {
+            self.multiply_density(guide, decision, q);
+        }
+    }
+
+    /// Multiplies into `q` the guide's density of one decision.
+    pub(crate) fn multiply_density(&self, guide: &dyn Guide, decision: Decision, q: &mut [f32]) {
         const CHUNK: usize = 4096;
         let (mut u, mut contexts, mut each) = (Vec::new(), Vec::new(), Vec::new());
-        for &decision in guide.models() {
-            for (vertex, columns) in self.columns(decision) {
-                for first in (0..q.len()).step_by(CHUNK) {
-                    let rows = first..(first + CHUNK).min(q.len());
-                    u.clear();
-                    contexts.clear();
-                    for row in rows.clone() {
-                        u.extend_from_slice(&self.u[row * self.dims..][columns.clone()]);
-                    }
-                    if guide.looks_at_contexts(decision) {
-                        let k = self.bounces();
-                        contexts.extend(rows.clone().map(|row| self.contexts[row * k + vertex]));
-                    }
-                    each.clear();
-                    each.resize(rows.len(), 1.0);
-                    guide.density(decision, &contexts, &u, &mut each);
-                    q[rows]
-                        .iter_mut()
-                        .zip(&each)
-                        .for_each(|(q, each)| *q *= each);
+        for (vertex, columns) in self.columns(decision) {
+            for first in (0..q.len()).step_by(CHUNK) {
+                let rows = first..(first + CHUNK).min(q.len());
+                u.clear();
+                contexts.clear();
+                for row in rows.clone() {
+                    u.extend_from_slice(&self.u[row * self.dims..][columns.clone()]);
                 }
+                if guide.looks_at_contexts(decision) {
+                    contexts.extend(rows.clone().map(|row| self.context(row, vertex)));
+                }
+                each.clear();
+                each.resize(rows.len(), 1.0);
+                guide.density(decision, &contexts, &u, &mut each);
+                q[rows]
+                    .iter_mut()
+                    .zip(&each)
+                    .for_each(|(q, each)| *q *= each);
             }
         }
     }
@@ -153,6 +209,8 @@ impl Records<'_> {
                 && self.f_max[r].is_finite()
                 && self.g[r].is_finite()
                 && self.g[r] > 0.0
+                && self.f_bsdf.get(r).is_none_or(|f| f.is_finite())
+                && self.g_bsdf.get(r).is_none_or(|&g| g.is_finite() && g > 0.0)
                 && self.u[r * self.dims..(r + 1) * self.dims]
                     .iter()
                     .all(|u| (0.0..1.0).contains(u))
@@ -215,13 +273,14 @@ impl Usable {
 }
 
 /// The value that a share `p` of all values does not exceed.
-fn quantile(values: impl Iterator<Item = f32>, p: f64) -> Option<f32> {
-    let mut values: Vec<f32> = values.collect();
+pub(crate) fn quantile<T: PartialOrd + Copy>(values: impl Iterator<Item = T>, p: f64) -> Option<T> {
+    let mut values: Vec<T> = values.collect();
     if values.is_empty() {
         return None;
     }
     let at = ((p * values.len() as f64).ceil() as usize).clamp(1, values.len()) - 1;
-    Some(*values.select_nth_unstable_by(at, f32::total_cmp).1)
+    let order = |a: &T, b: &T| a.partial_cmp(b).unwrap_or(std::cmp::Ordering::Equal);
+    Some(*values.select_nth_unstable_by(at, order).1)
 }
 
 #[cfg(test)]

@@ -4,6 +4,7 @@ use serde_json::{Map, Value};
 
 use crate::file::Contents;
 use crate::flow::{Domain, RealNvp, options::RealNvpOptions};
+use crate::table::{Kind, TableGuide};
 use crate::{Decision, Fit, Guide, GuideError, Recipe, Records, options};
 
 /// Signature of [`GuideSpec::fit`]: options, data, seed, progress.
@@ -30,13 +31,20 @@ pub struct GuideSpec {
     /// Seconds of training that each path costs on one core, roughly, for (options, columns); 0 where it does
     /// not depend on the number of paths. A render under a time budget gives no more paths than it can afford.
     pub seconds_per_path: fn(&Map<String, Value>, usize) -> f64,
+    /// The defensive mixture's share of uniform paths that suits it when nothing is known of the scene.
+    pub uniform_fraction: f32,
+    /// What it adds to the cost of a path, in paths of 1.5 µs (a two-bounce path on one core); measured by
+    /// `examples/guide_cost.rs`. selection uses it where no time is measured.
+    pub cost_ratio: f64,
+    /// Whether a fit is so cheap (well under a microsecond a path) that a render may repeat it as its paths double.
+    pub refine: bool,
     /// Fits; see [`fit`].
     pub fit: FitFn,
     /// Rebuilds the guide from a file, or says what does not fit together.
     pub(crate) restore: fn(Contents) -> Result<Box<dyn Guide>, String>,
 }
 
-static REGISTRY: [GuideSpec; 2] = [
+static REGISTRY: [GuideSpec; 5] = [
     GuideSpec {
         name: "realnvp",
         summary: "the thesis: RealNVP over all numbers at once, normal prior, samples outside the cube are lost",
@@ -46,6 +54,9 @@ static REGISTRY: [GuideSpec; 2] = [
         seconds_per_path: |o, d| {
             RealNvpOptions::parse(Domain::Cube, o).map_or(0.0, |o| o.seconds_per_path(d))
         },
+        uniform_fraction: 0.25,
+        cost_ratio: 1.3,
+        refine: false,
         fit: |o, r, s, p| RealNvp::fit(Domain::Cube, o, r, s, p),
         restore: |c| RealNvp::restore(Domain::Cube, c),
     },
@@ -58,8 +69,50 @@ static REGISTRY: [GuideSpec; 2] = [
         seconds_per_path: |o, d| {
             RealNvpOptions::parse(Domain::Logit, o).map_or(0.0, |o| o.seconds_per_path(d))
         },
+        uniform_fraction: 0.25,
+        cost_ratio: 1.3,
+        refine: false,
         fit: |o, r, s, p| RealNvp::fit(Domain::Logit, o, r, s, p),
         restore: |c| RealNvp::restore(Domain::Logit, c),
+    },
+    GuideSpec {
+        name: Kind::Direction.name(),
+        summary: "the direction at each vertex, counted per cell of position and normal",
+        models: &[Decision::Direction],
+        defaults: || Kind::Direction.defaults(),
+        validate: |o| Kind::Direction.validate(o),
+        seconds_per_path: |_, _| 0.0,
+        uniform_fraction: 0.1,
+        cost_ratio: 0.03,
+        refine: true,
+        fit: |o, r, _, p| TableGuide::fit(Kind::Direction, o, r, p),
+        restore: |c| TableGuide::restore(Kind::Direction, c),
+    },
+    GuideSpec {
+        name: Kind::Emitter.name(),
+        summary: "which emitter, counted per cell of the last vertex",
+        models: &[Decision::Emitter],
+        defaults: || Kind::Emitter.defaults(),
+        validate: |o| Kind::Emitter.validate(o),
+        seconds_per_path: |_, _| 0.0,
+        uniform_fraction: 0.1,
+        cost_ratio: 0.03,
+        refine: true,
+        fit: |o, r, _, p| TableGuide::fit(Kind::Emitter, o, r, p),
+        restore: |c| TableGuide::restore(Kind::Emitter, c),
+    },
+    GuideSpec {
+        name: Kind::Light.name(),
+        summary: "where on the emitter, counted per emitter and cell of the last vertex",
+        models: &[Decision::Light],
+        defaults: || Kind::Light.defaults(),
+        validate: |o| Kind::Light.validate(o),
+        seconds_per_path: |_, _| 0.0,
+        uniform_fraction: 0.1,
+        cost_ratio: 0.03,
+        refine: true,
+        fit: |o, r, _, p| TableGuide::fit(Kind::Light, o, r, p),
+        restore: |c| TableGuide::restore(Kind::Light, c),
     },
 ];
 

@@ -412,6 +412,7 @@ impl Guide for RealNvp {
             guide: self.name().to_owned(),
             config,
             tensors,
+            ..Contents::default()
         })
     }
 }

@@ -3,9 +3,11 @@
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, OnceLock};
 
-use pss_guide::{Decision, Fit, Guide, Header, Records, fit};
+use pss_guide::{Context, Decision, Fit, Guide, GuideSpec, Header, Records, fit, registry};
 use pss_rng::{Purpose, Stream};
 use serde_json::{Map, Value};
+
+use crate::world::{self, World};
 
 /// What the tests' files claim to be fitted for.
 pub(crate) fn header() -> Header {
@@ -71,7 +73,29 @@ impl Target {
     }
 }
 
-/// A guide fitted to `n` uniform paths of [`Target`].
+/// Whether a guide models whole paths, and is fitted to [`Target`]; others are fitted to a [`World`].
+pub(crate) fn is_whole(name: &str) -> bool {
+    pss_guide::find(name)
+        .unwrap()
+        .models
+        .contains(&Decision::Path)
+}
+
+/// The registry's lines whose fit takes epochs.
+pub(crate) fn trained() -> impl Iterator<Item = &'static GuideSpec> {
+    registry()
+        .iter()
+        .filter(|spec| (spec.defaults)().contains_key("epochs"))
+}
+
+/// Options that make training short where there is training.
+pub(crate) fn epochs(name: &str, n: u32) -> Map<String, Value> {
+    let trained = trained().any(|spec| spec.name == name);
+    let list = [("epochs", n.into())];
+    options(if trained { &list } else { &[] })
+}
+
+/// A guide fitted to `n` uniform paths; `dims` is odd unless it models whole paths.
 pub(crate) fn fit_with(
     name: &str,
     dims: usize,
@@ -79,6 +103,14 @@ pub(crate) fn fit_with(
     options: Map<String, Value>,
     seed: u64,
 ) -> Fit {
+    if !is_whole(name) {
+        let world = World {
+            k: (dims - 1) / 2,
+            ..World::DEFAULT
+        };
+        let paths = world.draw(n, None, 0);
+        return fit(name, &options, &paths.records(), seed, &mut |_| true).unwrap();
+    }
     let (u, f) = Target { dims }.paths(n, 0);
     let g = vec![1.0; n];
     let records = Records {
@@ -93,6 +125,69 @@ pub(crate) fn fit_with(
     fit(name, &options, &records, seed, &mut |_| true).unwrap()
 }
 
+/// One decision of a guide, at one place.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Case {
+    pub(crate) decision: Decision,
+    pub(crate) width: usize,
+    place: Option<Context>,
+}
+
+impl Case {
+    /// The place for `n` rows.
+    pub(crate) fn contexts(&self, n: usize) -> Vec<Context> {
+        self.place.map_or(Vec::new(), |c| vec![c; n])
+    }
+
+    pub(crate) fn sample(&self, guide: &dyn Guide, u: &mut [f32], q: &mut [f32]) {
+        guide.sample(self.decision, &self.contexts(q.len()), u, q);
+    }
+
+    pub(crate) fn density(&self, guide: &dyn Guide, u: &[f32], q: &mut [f32]) {
+        guide.density(self.decision, &self.contexts(q.len()), u, q);
+    }
+}
+
+/// All decisions of a guide, each at several places.
+pub(crate) fn cases(guide: &dyn Guide) -> Vec<Case> {
+    let mut list = Vec::new();
+    for &decision in guide.models() {
+        let width = match decision {
+            Decision::Path => guide.dims(),
+            Decision::Emitter => 1,
+            Decision::Direction | Decision::Light => 2,
+        };
+        let case = |place| Case {
+            decision,
+            width,
+            place,
+        };
+        if guide.looks_at_contexts(decision) {
+            list.extend(
+                world::places(&World::DEFAULT, decision)
+                    .into_iter()
+                    .map(|c| case(Some(c))),
+            );
+        } else {
+            list.push(case(None));
+        }
+    }
+    list
+}
+
+/// Samples and densities of every case, bit for bit.
+pub(crate) fn fingerprint(guide: &dyn Guide) -> Vec<u32> {
+    let mut bits = Vec::new();
+    for case in cases(guide) {
+        let (mut u, mut q) = (uniform(500, case.width, 5), vec![0.0; 500]);
+        case.sample(guide, &mut u, &mut q);
+        bits.extend(u.iter().chain(&q).map(|x| x.to_bits()));
+        case.density(guide, &uniform(500, case.width, 4), &mut q);
+        bits.extend(q.iter().map(|x| x.to_bits()));
+    }
+    bits
+}
+
 /// The default fit of the tests, made once in each process.
 pub(crate) fn fit_small(name: &'static str, dims: usize) -> Arc<Fit> {
     type Made = Mutex<BTreeMap<(&'static str, usize), Arc<OnceLock<Arc<Fit>>>>>;
@@ -103,8 +198,16 @@ pub(crate) fn fit_small(name: &'static str, dims: usize) -> Arc<Fit> {
         .entry((name, dims))
         .or_default()
         .clone();
-    cell.get_or_init(|| Arc::new(fit_with(name, dims, 6000, Map::new(), 1)))
-        .clone()
+    cell.get_or_init(|| {
+        Arc::new(fit_with(
+            name,
+            dims,
+            if is_whole(name) { 6000 } else { 20_000 },
+            Map::new(),
+            1,
+        ))
+    })
+    .clone()
 }
 
 /// Mean and its standard error.
@@ -119,41 +222,45 @@ pub(crate) fn mean(values: impl Iterator<Item = f64>) -> (f64, f64) {
     (mean, (square / (n - 1.0) / n).sqrt())
 }
 
-/// p-value of Pearson's χ² over 16 × 16 cells and the outside, 200,000 samples against the integrated
-/// density; a share `wrong` of the samples is replaced by uniform numbers.
-pub(crate) fn chi_square(guide: &dyn Guide, wrong: f64) -> f64 {
+/// p-value of Pearson's χ² over 16 cells along each of one or two numbers and the outside, 200,000 samples against the
+/// integrated density; a share `wrong` of the samples is replaced by uniform numbers.
+pub(crate) fn chi_square(guide: &dyn Guide, case: Case, wrong: f64) -> f64 {
     const CELLS: usize = 16;
-    const INNER: usize = 8;
-    let n = 200_000;
-    let base = uniform(n, 2, 7);
+    let (n, width) = (200_000, case.width);
+    let inner = if width == 1 { 2000 } else { 8 };
+    let all = CELLS.pow(width as u32);
+    let base = uniform(n, width, 7);
     let (mut u, mut q) = (base.clone(), vec![0.0; n]);
-    guide.sample(Decision::Path, &[], &mut u, &mut q);
-    let replaced = (wrong * n as f64) as usize * 2;
+    case.sample(guide, &mut u, &mut q);
+    let replaced = (wrong * n as f64) as usize * width;
     u[..replaced].copy_from_slice(&base[..replaced]);
-    let mut counts = vec![0.0; CELLS * CELLS + 1];
-    for u in u.chunks_exact(2) {
+    let mut counts = vec![0.0; all + 1];
+    for u in u.chunks_exact(width) {
         let inside = u.iter().all(|u| (0.0..1.0).contains(u));
-        let cell = |u: f32| (u * CELLS as f32) as usize;
-        counts[if inside {
-            cell(u[1]) * CELLS + cell(u[0])
-        } else {
-            CELLS * CELLS
-        }] += 1.0;
+        let cell = u
+            .iter()
+            .rev()
+            .fold(0, |i, u| i * CELLS + (u * CELLS as f32) as usize);
+        counts[if inside { cell } else { all }] += 1.0;
     }
 
-    let side = CELLS * INNER;
+    let side = CELLS * inner;
+    let points = side.pow(width as u32);
     let middle = |i: usize| (i as f32 + 0.5) / side as f32;
-    let grid: Vec<f32> = (0..side * side)
-        .flat_map(|i| [middle(i % side), middle(i / side)])
+    let at = |point: usize, axis: usize| point / side.pow(axis as u32) % side;
+    let grid: Vec<f32> = (0..points)
+        .flat_map(|p| (0..width).map(move |axis| middle(at(p, axis))))
         .collect();
-    let mut density = vec![0.0; side * side];
-    guide.density(Decision::Path, &[], &grid, &mut density);
-    let mut expected = vec![0.0; CELLS * CELLS + 1];
-    for (i, q) in density.iter().enumerate() {
-        expected[i / side / INNER * CELLS + i % side / INNER] +=
-            n as f64 * f64::from(*q) / (side * side) as f64;
+    let mut density = vec![0.0; points];
+    case.density(guide, &grid, &mut density);
+    let mut expected = vec![0.0; all + 1];
+    for (p, q) in density.iter().enumerate() {
+        let cell = (0..width)
+            .rev()
+            .fold(0, |i, axis| i * CELLS + at(p, axis) / inner);
+        expected[cell] += n as f64 * f64::from(*q) / points as f64;
     }
-    expected[CELLS * CELLS] = (n as f64 - expected.iter().sum::<f64>()).max(0.0);
+    expected[all] = (n as f64 - expected.iter().sum::<f64>()).max(0.0);
 
     // Cells that expect less than five samples are pooled.
     let (mut statistic, mut degrees, mut pool) = (0.0, -1.0, (0.0, 0.0));

@@ -5,3 +5,5 @@ mod common;
 mod density;
 mod files;
 mod input;
+mod places;
+mod world;

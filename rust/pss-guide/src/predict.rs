@@ -1,0 +1,152 @@
+//! What a guide would gain, predicted from paths that it was not fitted to and that cost nothing more.
+//!
+//! With m = a + (1 − a)·q, the variance of a pixel's estimate is ∫f²/m − I². The integral is estimated from paths
+//! drawn with density g, f²/(m·g), tile by tile of the image, and relative to the tile's mean as in relMSE:
+//!
+//! V(a) = Σ over tiles of [mean f²/(m·g) − Ī²] ÷ (Ī² + ε),  ε = (0.1 · mean of Ī)²,  gain(a) = V(1)/V(a).
+//!
+//! The spread between the pixels of a tile counts as noise that no guide removes, which makes gains conservative. Of the
+//! two terms of f each is divided by the density of its own numbers: f_nee²/m + (2 f_nee f_bsdf + f_bsdf²)/m′ with the
+//! directions' marginal m′.
+
+use crate::{Decision, Guide, Records};
+
+/// Most tiles along an axis.
+const SIDE: usize = 16;
+
+/// Paths that a tile shall hold on average.
+const PATHS_PER_TILE: f64 = 64.0;
+
+/// No gain is believed beyond this: where V(a) is as small, it drowns in its own error.
+const MOST_GAIN: f64 = 1000.0;
+
+/// A guide's densities of some paths' numbers.
+#[derive(Clone, Debug)]
+pub(crate) struct Densities {
+    /// Of all numbers.
+    pub(crate) all: Vec<f32>,
+    /// Of those that the BSDF-sampled term uses.
+    pub(crate) directions: Vec<f32>,
+}
+
+impl Densities {
+    /// Of a guide at each of the paths.
+    pub(crate) fn of(guide: &dyn Guide, records: &Records<'_>) -> Self {
+        let mut all = vec![1.0; records.f.len()];
+        records.multiply_densities(guide, &mut all);
+        let whole = guide.models().contains(&Decision::Path);
+        let directions = if whole || guide.models().contains(&Decision::Direction) {
+            let only = |d: &Decision| matches!(d, Decision::Path | Decision::Direction);
+            if guide.models().iter().all(only) {
+                all.clone()
+            } else {
+                let mut directions = vec![1.0; records.f.len()];
+                records.multiply_density(guide, Decision::Direction, &mut directions);
+                directions
+            }
+        } else {
+            vec![1.0; records.f.len()]
+        };
+        Self { all, directions }
+    }
+
+    /// Of the product with another guide that models other numbers.
+    pub(crate) fn times(mut self, other: &Self) -> Self {
+        let multiply = |a: &mut [f32], b: &[f32]| a.iter_mut().zip(b).for_each(|(a, b)| *a *= b);
+        multiply(&mut self.all, &other.all);
+        multiply(&mut self.directions, &other.directions);
+        self
+    }
+}
+
+/// Held-out paths, ready for predictions.
+#[derive(Debug)]
+pub(crate) struct HeldOut<'a> {
+    records: Records<'a>,
+    side: usize,
+    /// By tile: 1 ÷ (paths · (Ī² + ε)), 0 for tiles without light.
+    scale: Vec<f64>,
+    /// Σ over tiles of Ī² ÷ (Ī² + ε).
+    square: f64,
+    /// V(1).
+    uniform: f64,
+}
+
+impl<'a> HeldOut<'a> {
+    /// `None` where no path carries light, or where uniform numbers have no variance to win.
+    pub(crate) fn new(records: Records<'a>) -> Option<Self> {
+        let paths = records.paths();
+        let side = ((paths / PATHS_PER_TILE).sqrt() as usize).clamp(1, SIDE);
+        let mut held = Self {
+            records,
+            side,
+            scale: vec![0.0; side * side],
+            square: 0.0,
+            uniform: 0.0,
+        };
+        let each = paths / (side * side) as f64;
+        let mut means = vec![0.0; side * side];
+        for row in held.rows() {
+            means[held.tile(row)] += held.records.terms(row).value() / each;
+        }
+        let mean = means.iter().sum::<f64>() / means.len() as f64;
+        let epsilon = (0.1 * mean).powi(2);
+        if !(mean > 0.0 && mean.is_finite()) {
+            return None;
+        }
+        for (scale, mean) in held.scale.iter_mut().zip(&means) {
+            *scale = 1.0 / (each * (mean * mean + epsilon));
+            held.square += mean * mean / (mean * mean + epsilon);
+        }
+        let one = vec![1.0; held.records.f.len()];
+        let one = Densities {
+            all: one.clone(),
+            directions: one,
+        };
+        held.uniform = held.variance(&one, 1.0);
+        (held.uniform > 0.0).then_some(held)
+    }
+
+    /// The paths.
+    pub(crate) fn records(&self) -> &Records<'a> {
+        &self.records
+    }
+
+    /// gain(a) = V(1)/V(a) of the mixture with a guide of these densities.
+    pub(crate) fn gain(&self, q: &Densities, a: f32) -> f64 {
+        let least = self.uniform / MOST_GAIN;
+        self.uniform / self.variance(q, a).max(least)
+    }
+
+    fn variance(&self, q: &Densities, a: f32) -> f64 {
+        let a = f64::from(a);
+        let mixture = |q: f32| {
+            if a >= 1.0 {
+                1.0
+            } else {
+                a + (1.0 - a) * f64::from(q)
+            }
+        };
+        let mut sum = 0.0;
+        for row in self.rows() {
+            let terms = self.records.terms(row);
+            let value = terms.nee_square() / mixture(q.all[row])
+                + terms.bsdf_square() / mixture(q.directions[row]);
+            sum += value * self.scale[self.tile(row)];
+        }
+        sum - self.square
+    }
+
+    fn rows(&self) -> impl Iterator<Item = usize> + use<'a> {
+        let (f, g) = (self.records.f, self.records.g);
+        (0..f.len()).filter(move |&r| f[r].is_finite() && g[r].is_finite() && g[r] > 0.0)
+    }
+
+    fn tile(&self, row: usize) -> usize {
+        let Some(&[x, y]) = self.records.pixel.get(row) else {
+            return 0;
+        };
+        let at = |x: f32| ((x * self.side as f32) as usize).min(self.side - 1);
+        at(y) * self.side + at(x)
+    }
+}

@@ -1,0 +1,428 @@
+//! `auto`: the smallest model that pays, or none.
+//!
+//! A quarter of the paths so far is held out; candidates are fitted to the rest, and what they would gain is predicted
+//! from the quarter (`predict`), for several shares a of uniform paths. Of the gain goes what the guide costs: its
+//! share of a path's time, and its training out of what is left of the budget. Whatever wins is fitted again to
+//! all paths; where nothing surely wins, uniform numbers stay, and no path was wasted.
+//!
+//! A composite's factors are fitted once; every subset of them is a candidate, so factors that do not pay are dropped.
+
+use std::time::Instant;
+
+use serde::Serialize;
+use serde_json::{Map, json};
+
+use crate::predict::{Densities, HeldOut};
+use crate::{Context, Decision, Emitter, Fit, Guide, GuideError, Recipe, Records};
+
+/// Shares of uniform paths that are tried.
+const FRACTIONS: [f32; 3] = [0.1, 0.25, 0.5];
+
+/// A guide must gain as much, costs deducted, and the more the fewer held-out paths promise it; see [`least_gain`].
+const LEAST_GAIN: f64 = 1.05;
+
+/// A smaller model is taken where it comes as close to the best.
+const AS_GOOD: f64 = 0.98;
+
+/// Training may take this share of the time that is left.
+const MOST_TRAINING: f64 = 0.1;
+
+/// Light-carrying paths that are looked at, at most: more would tell little, and the choice must not cost more than it
+/// brings.
+const MOST_ROWS: usize = 1 << 19;
+
+/// Of `HOLD_OUT` paths, one is held out.
+const HOLD_OUT: u64 = 4;
+
+/// Rows that a guide's cost is measured with.
+const COST_ROWS: usize = 1 << 14;
+
+/// Seconds that a uniform path is taken to cost where the choice must not depend on the machine.
+const NOMINAL_PATH: f64 = 1e-6;
+
+/// What is left to do when a guide is chosen.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Remaining {
+    /// Paths still to be rendered, about, if they were uniform.
+    pub paths: f64,
+    /// Measured cost of a uniform path on one thread, in seconds; `None` where the choice must not depend on the machine:
+    /// costs are then the registry's fixed ratios.
+    pub seconds_per_path: Option<f64>,
+    /// Threads that render.
+    pub threads: usize,
+    /// Share of the paths that find all their vertices, in [0, 1]: only these ask the guide everything.
+    pub found: f64,
+}
+
+/// What was thought of a candidate.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct CandidateReport {
+    /// Its name.
+    pub name: String,
+    /// The best share of uniform paths in its mixture.
+    pub a: f32,
+    /// Predicted variance of uniform numbers ÷ that of the mixture; 1 for `none`.
+    pub predicted_gain: f64,
+    /// What the guide adds to the cost of a path, as a share of it.
+    pub cost_ratio: f64,
+    /// Share of the time that is left that training it takes.
+    pub training_share: f64,
+    /// The gain, costs deducted.
+    pub net_gain: f64,
+    /// Whether it is used.
+    pub chosen: bool,
+    /// Why, or why not.
+    pub why: String,
+}
+
+/// What [`select`] came to.
+#[derive(Debug)]
+pub struct Selection {
+    /// What to fit; `None` for uniform numbers.
+    pub recipe: Option<Recipe>,
+    /// Share of uniform paths in the mixture.
+    pub uniform_fraction: f32,
+    /// The recipe fitted to all paths.
+    pub fit: Option<Fit>,
+    /// All that was considered, the best first.
+    pub candidates: Vec<CandidateReport>,
+}
+
+/// The candidates of `auto`; every subset of a composite's factors is meant, too.
+///
+/// # Errors
+/// None that the registry of this build does not cause.
+pub fn candidates() -> Result<Vec<Recipe>, GuideError> {
+    let stiff = json!({
+        "direction-table": { "kappa": 32.0 },
+        "emitter-table": { "kappa": 32.0 },
+        "light-table": { "kappa": 32.0 },
+    });
+    let stiff = stiff.as_object().cloned().unwrap_or_default();
+    Ok(vec![
+        Recipe::parse("table", &Map::new())?,
+        Recipe::parse("table", &stiff)?,
+    ])
+}
+
+/// The candidate of a label that [`select`] gave, for a replay.
+pub fn recall(label: &str) -> Option<Recipe> {
+    let families = candidates().ok()?;
+    families
+        .iter()
+        .flat_map(Recipe::subsets)
+        .find(|recipe| recipe.label() == label)
+}
+
+/// Picks a guide for the paths that are left, from the paths so far. The result depends on the arguments alone, bit for
+/// bit, unless costs were measured.
+///
+/// # Errors
+/// [`GuideError`] of the fits, but for [`GuideError::TooFewPaths`], which ends in uniform numbers.
+pub fn select(
+    records: &Records<'_>,
+    candidates: &[Recipe],
+    remaining: &Remaining,
+    seed: u64,
+    progress: &mut dyn FnMut(f32) -> bool,
+) -> Result<Selection, GuideError> {
+    let (fitted_to, held) = split(records);
+    let (fitted_to, held) = (fitted_to.view(records), held.view(records));
+    let least = least_gain(held.f.len());
+    let mut considered = vec![Considered::none()];
+    if let Some(held) = HeldOut::new(held) {
+        for (i, family) in candidates.iter().enumerate() {
+            let family = family.without_idle(records);
+            let Some(family) = family.filter(|f| affordable(f, records, remaining)) else {
+                continue;
+            };
+            let share = |done: f32| 0.7 * (i as f32 + done) / candidates.len() as f32;
+            let mut progress = |done| progress(share(done));
+            match consider(&family, &fitted_to, &held, remaining, seed, &mut progress) {
+                Ok(members) => considered.extend(members),
+                Err(GuideError::TooFewPaths { .. }) => {}
+                Err(e) => return Err(e),
+            }
+        }
+    }
+    considered.sort_by(|x, y| y.report.net_gain.total_cmp(&x.report.net_gain));
+    let best = considered[0].report.net_gain;
+    let smallest = considered
+        .iter()
+        .enumerate()
+        .filter(|(_, c)| c.report.net_gain >= AS_GOOD * best)
+        .min_by_key(|(_, c)| c.size());
+    let mut at = smallest.map_or(0, |(i, _)| i);
+    if considered[at].report.net_gain < least {
+        at = considered
+            .iter()
+            .position(|c| c.recipe.is_none())
+            .unwrap_or(0);
+    }
+    explain(&mut considered, at, best, least);
+    let chosen = &considered[at];
+    let mut selection = Selection {
+        recipe: chosen.recipe.clone(),
+        uniform_fraction: chosen.report.a,
+        fit: None,
+        candidates: Vec::new(),
+    };
+    if let Some(recipe) = &selection.recipe {
+        selection.fit = Some(recipe.fit(records, seed, &mut |done| progress(0.7 + 0.3 * done))?);
+    }
+    selection.candidates = considered.into_iter().map(|c| c.report).collect();
+    Ok(selection)
+}
+
+/// A candidate and what was thought of it.
+struct Considered {
+    recipe: Option<Recipe>,
+    report: CandidateReport,
+}
+
+impl Considered {
+    fn none() -> Self {
+        Self {
+            recipe: None,
+            report: CandidateReport {
+                name: "none".to_owned(),
+                a: 1.0,
+                predicted_gain: 1.0,
+                cost_ratio: 0.0,
+                training_share: 0.0,
+                net_gain: 1.0,
+                chosen: false,
+                why: String::new(),
+            },
+        }
+    }
+
+    /// Number of factors.
+    fn size(&self) -> usize {
+        self.recipe.as_ref().map_or(0, |r| r.specs().count())
+    }
+}
+
+/// Fits the factors of a composite, and predicts the gain of all subsets of them.
+fn consider(
+    family: &Recipe,
+    fitted_to: &Records<'_>,
+    held: &HeldOut<'_>,
+    remaining: &Remaining,
+    seed: u64,
+    progress: &mut dyn FnMut(f32) -> bool,
+) -> Result<Vec<Considered>, GuideError> {
+    let start = Instant::now();
+    let fits = family.fit_factors(fitted_to, seed, progress)?;
+    let seconds = start.elapsed().as_secs_f64();
+    let densities: Vec<Densities> = fits
+        .iter()
+        .map(|fit| Densities::of(&*fit.guide, held.records()))
+        .collect();
+    let costs: Vec<f64> = family
+        .specs()
+        .zip(&fits)
+        .map(|(spec, fit)| cost_ratio(spec.cost_ratio, &*fit.guide, held.records(), remaining))
+        .collect();
+    let mut members = Vec::new();
+    for set in 1..1usize << fits.len() {
+        let factors: Vec<usize> = (0..fits.len()).filter(|i| set >> i & 1 == 1).collect();
+        let mut q = densities[factors[0]].clone();
+        for &i in &factors[1..] {
+            q = q.times(&densities[i]);
+        }
+        let gains = FRACTIONS.map(|a| (a, held.gain(&q, a)));
+        let (a, gain) = gains
+            .into_iter()
+            .fold((1.0, 0.0), |best, g| if g.1 > best.1 { g } else { best });
+        let cost_ratio: f64 = factors.iter().map(|&i| costs[i]).sum();
+        let recipe = family.subset(&factors);
+        let training_share = training_share(&recipe, fitted_to, seconds, remaining);
+        members.push(Considered {
+            report: CandidateReport {
+                name: recipe.label(),
+                a,
+                predicted_gain: gain,
+                cost_ratio,
+                training_share,
+                net_gain: gain / (1.0 + cost_ratio) * (1.0 - training_share).max(0.0),
+                chosen: false,
+                why: String::new(),
+            },
+            recipe: Some(recipe),
+        });
+    }
+    Ok(members)
+}
+
+/// What a guide must gain on a prediction from so many light-carrying paths: the best of many candidates is the one that
+/// chance favours, by about so much.
+fn least_gain(held: usize) -> f64 {
+    LEAST_GAIN + 4.0 / (held.max(1) as f64).sqrt()
+}
+
+/// Seconds that the paths which are left take on all threads.
+fn seconds_left(remaining: &Remaining) -> f64 {
+    let each = remaining.seconds_per_path.unwrap_or(NOMINAL_PATH);
+    remaining.paths * each / remaining.threads.max(1) as f64
+}
+
+/// Whether training is worth a thought.
+fn affordable(recipe: &Recipe, records: &Records<'_>, remaining: &Remaining) -> bool {
+    let training = recipe.seconds_per_path(records.dims) * records.f.len() as f64;
+    training <= MOST_TRAINING * seconds_left(remaining)
+}
+
+/// Share of the time that is left that fitting to all paths takes: measured on a part of them, or as the registry says.
+fn training_share(
+    recipe: &Recipe,
+    fitted_to: &Records<'_>,
+    seconds: f64,
+    remaining: &Remaining,
+) -> f64 {
+    let training = match remaining.seconds_per_path {
+        Some(_) => seconds,
+        None => recipe.seconds_per_path(fitted_to.dims) * fitted_to.f.len() as f64,
+    };
+    (training / seconds_left(remaining).max(f64::MIN_POSITIVE)).min(1.0)
+}
+
+/// What a guide adds to a path's cost, as a share of it: measured where the path's own cost is.
+fn cost_ratio(fixed: f64, guide: &dyn Guide, records: &Records<'_>, remaining: &Remaining) -> f64 {
+    let Some(path) = remaining.seconds_per_path else {
+        return fixed;
+    };
+    let rows = records.f.len().min(COST_ROWS);
+    if rows == 0 {
+        return fixed;
+    }
+    let mut seconds = 0.0;
+    for &decision in guide.models() {
+        for (vertex, columns) in records.columns(decision) {
+            let mut u: Vec<f32> = (0..rows)
+                .flat_map(|row| {
+                    records.u[row * records.dims..][columns.clone()]
+                        .iter()
+                        .copied()
+                })
+                .collect();
+            let contexts: Vec<Context> = if guide.looks_at_contexts(decision) {
+                (0..rows).map(|row| records.context(row, vertex)).collect()
+            } else {
+                Vec::new()
+            };
+            let mut q = vec![1.0; rows];
+            let start = Instant::now();
+            guide.sample(decision, &contexts, &mut u, &mut q);
+            seconds += start.elapsed().as_secs_f64();
+        }
+    }
+    seconds / rows as f64 * remaining.found / path
+}
+
+/// Puts reasons into words.
+fn explain(considered: &mut [Considered], at: usize, best: f64, least: f64) {
+    let least_percent = 100.0 * (least - 1.0);
+    for (i, c) in considered.iter_mut().enumerate() {
+        c.report.chosen = i == at;
+        let net = c.report.net_gain;
+        c.report.why = if i == at {
+            match c.recipe {
+                None => format!("nothing surely gains {least_percent:.0} % after its cost"),
+                Some(_) if net < best => "as good as the best, and smaller".to_owned(),
+                Some(_) => "the largest gain after its cost".to_owned(),
+            }
+        } else if c.recipe.is_none() {
+            "random numbers, for comparison".to_owned()
+        } else if net < least {
+            format!("gains less than {least_percent:.0} % after its cost")
+        } else if net >= AS_GOOD * best {
+            "no better than a smaller model".to_owned()
+        } else {
+            format!("{:.0} % below the best", 100.0 * (1.0 - net / best))
+        };
+    }
+}
+
+/// Rows of records that were picked out.
+#[derive(Default)]
+struct Part {
+    u: Vec<f32>,
+    f: Vec<f32>,
+    f_bsdf: Vec<f32>,
+    f_max: Vec<f32>,
+    g: Vec<f32>,
+    g_bsdf: Vec<f32>,
+    contexts: Vec<Context>,
+    pixel: Vec<[f32; 2]>,
+    /// Share of all rows that were meant to be picked.
+    share: f64,
+}
+
+impl Part {
+    fn push(&mut self, records: &Records<'_>, row: usize) {
+        let (d, k) = (records.dims, records.bounces());
+        self.u.extend_from_slice(&records.u[row * d..][..d]);
+        self.f.push(records.f[row]);
+        self.f_max.push(records.f_max[row]);
+        self.g.push(records.g[row]);
+        self.f_bsdf.extend(records.f_bsdf.get(row));
+        self.g_bsdf.extend(records.g_bsdf.get(row));
+        self.contexts.extend(
+            records
+                .contexts
+                .get(row * k..(row + 1) * k)
+                .unwrap_or_default(),
+        );
+        self.pixel.extend(records.pixel.get(row));
+    }
+
+    fn view<'a>(&'a self, records: &Records<'a>) -> Records<'a> {
+        let emitters: &'a [Emitter] = records.emitters;
+        let paths = (records.paths() * self.share) as u64;
+        Records {
+            dims: records.dims,
+            u: &self.u,
+            f: &self.f,
+            f_bsdf: &self.f_bsdf,
+            f_max: &self.f_max,
+            g: &self.g,
+            g_bsdf: &self.g_bsdf,
+            contexts: &self.contexts,
+            pixel: &self.pixel,
+            emitters,
+            zeros: paths.saturating_sub(self.f.len() as u64),
+        }
+    }
+}
+
+/// The paths to fit to, and those that are held out.
+fn split(records: &Records<'_>) -> (Part, Part) {
+    let rows = records.f.len();
+    let stride = rows.div_ceil(MOST_ROWS).max(1);
+    let kept = 1.0 / stride as f64;
+    let held_share = kept / HOLD_OUT as f64;
+    let (mut fitted_to, mut held) = (Part::default(), Part::default());
+    (fitted_to.share, held.share) = (kept - held_share, held_share);
+    for (i, row) in (0..rows).step_by(stride).enumerate() {
+        // Scrambled, since the samples of a pixel lie next to each other.
+        let scrambled = (i as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 32;
+        if scrambled % HOLD_OUT == 0 {
+            held.push(records, row);
+        } else {
+            fitted_to.push(records, row);
+        }
+    }
+    (fitted_to, held)
+}
+
+/// Whether a factor's decision has anything to decide.
+pub(crate) fn is_idle(models: &[Decision], records: &Records<'_>) -> bool {
+    let idle = |d: &Decision| match d {
+        Decision::Direction => records.bounces() < 2,
+        Decision::Emitter => records.emitters.len() < 2,
+        Decision::Light => records.emitters.is_empty(),
+        Decision::Path => false,
+    };
+    models.iter().all(idle)
+}
