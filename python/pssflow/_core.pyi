@@ -166,6 +166,9 @@ class Scene:
     def rays_alone(self, *, spp: int, k: int, threads: int = 0) -> dict[str, float]:
         """Times only the Embree queries that rendering makes: {"seconds", "rays", "rays_per_path"}."""
 
+def guide_aliases() -> str:
+    """Names that stand for several guides, JSON: {name: guides joined by `+`}."""
+
 def guides() -> str:
     """JSON list of the registry: [{"name", "summary", "options": {default options}}]."""
 

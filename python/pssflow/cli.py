@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import click
 
 from .files import check_writable, first_line
-from .options import EMITTER_STRATEGIES, PARAMETRISATIONS, PRESETS
+from .options import COMBINATIONS, EMITTER_STRATEGIES, PARAMETRISATIONS, PRESETS
 from .params import GuideNames, GuideOption, GuideSetting, Positive, SceneParameter, Size
 from .terminal import Terminal, run_command
 from .thesis import SCENES as THESIS_SCENES
@@ -138,6 +138,11 @@ def _render_options(command: F) -> F:
             click.option("--seed", type=click.IntRange(0, 2**64 - 1), help="[default: 0]"),
             click.option("--threads", type=click.IntRange(1, 4096), help="[default: one a core]"),
             click.option(
+                "--combine",
+                type=click.Choice(COMBINATIONS),
+                help="Weights of the passes: by samples (default, unbiased) or by variance.",
+            ),
+            click.option(
                 "--preset", type=click.Choice(tuple(PRESETS)), help="Settings of the source thesis."
             ),
             click.option(
@@ -159,9 +164,11 @@ def _render_options(command: F) -> F:
 @_scene_options
 @click.option("-o", "--output", required=True, metavar="OUT.exr", help="Image and variance.")
 @click.option(
-    "--guide", help="`none` (random numbers), a guide's name, or a saved one.  [default: realnvp]"
+    "--guide",
+    help="`auto` (whatever pays, or none), `none` (random numbers), a guide's name, or a saved one.  [default: auto]",
 )
 @_render_options
+@click.option("--explain", is_flag=True, help="Print what `auto` considered, and why.")
 @click.option("--replay", metavar="RESULT.json", help="Repeat the recorded run, bit for bit.")
 @click.option("--save-guide", metavar="FILE", help="Save what was learned.")
 @click.option("--load-guide", metavar="FILE", help="Use a saved guide; no pilot is spent.")
@@ -171,6 +178,7 @@ def render(
     *,
     output: str,
     guide: str | None,
+    explain: bool,
     replay: str | None,
     save_guide: str | None,
     load_guide: str | None,
@@ -180,7 +188,7 @@ def render(
 ) -> None:
     """Render the light of exactly k bounces; writes OUT.exr, and its record beside it as OUT.json."""
     from . import report
-    from .guide import Guide
+    from .guide import Guide, usual_guide
     from .options import read_replay
     from .output import write_json
 
@@ -196,7 +204,7 @@ def render(
         if path is not None:
             check_writable(path)
     record = None if replay is None else read_replay(_one_run(replay))
-    name = record["guide"] if record else load_guide or guide or "realnvp"
+    name = record["guide"] if record else load_guide or guide or usual_guide(options["preset"])
     if load_guide is not None and not Path(load_guide).is_file():
         raise FileNotFoundError(f"{load_guide}: there is no such file")
     if save_guide is not None and name == "none":
@@ -224,6 +232,10 @@ def render(
     else:
         terminal.out.print(_headline(scene, result.stats), highlight=False, soft_wrap=True)
         terminal.out.print(report.runs_table([result.stats]))
+        if explain:
+            terminal.out.print(report.candidates_table(result.stats))
+        elif result.stats["candidates"]:
+            terminal.out.print(report.choice_line(result.stats), highlight=False, soft_wrap=True)
         terminal.out.print(f"wrote {target} and {record_target}", highlight=False, soft_wrap=True)
 
 
@@ -232,7 +244,7 @@ def render(
 @click.option(
     "--guides",
     type=GuideNames(),
-    default="none,realnvp",
+    default="none,realnvp,auto",
     show_default=True,
     help="Guides, joined by commas.",
 )
@@ -403,6 +415,7 @@ def _arguments(options: Mapping[str, Any]) -> dict[str, Any]:
             "emitter_strategy",
             "pilot_spp",
             "keep_pilot",
+            "combine",
             "seed",
             "threads",
             "preset",

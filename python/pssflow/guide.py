@@ -40,9 +40,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from . import _core
-from .options import check_integer
+from .options import DEFAULT_GUIDE, PRESETS, check_integer
 
-__all__ = ["Choice", "ForeignGuide", "Guide", "choose", "guide_names", "is_path", "registry"]
+__all__ = [
+    "Choice",
+    "ForeignGuide",
+    "Guide",
+    "aliases",
+    "choose",
+    "guide_names",
+    "is_path",
+    "registry",
+    "usual_guide",
+]
 
 F32 = NDArray[np.float32]
 
@@ -234,7 +244,7 @@ class Choice:
     kind: str
     """What the core is told: `none`, a name of the registry, `ready` or `foreign`."""
     learns: bool
-    """Whether it takes a pilot."""
+    """Whether it takes a pilot; `auto` may end there."""
     options: dict[str, Any]
     """The guide's own options."""
     given: Guide | ForeignGuide | None = None
@@ -248,9 +258,19 @@ def registry() -> dict[str, dict[str, Any]]:
     return {entry.pop("name"): entry for entry in json.loads(_core.guides())}
 
 
+def aliases() -> dict[str, str]:
+    """Names that stand for several guides, and these, joined by `+`."""
+    return json.loads(_core.guide_aliases())
+
+
 def guide_names() -> list[str]:
     """All names that `guide=` understands; those of the registry may be joined by `+`."""
-    return ["none", *registry()]
+    return ["none", "auto", *registry(), *aliases()]
+
+
+def usual_guide(preset: str | None) -> str:
+    """The guide where none is given."""
+    return DEFAULT_GUIDE if preset not in PRESETS else PRESETS[preset].guide
 
 
 def choose(guide: Any, options: Mapping[str, Any]) -> Choice:
@@ -316,8 +336,11 @@ def _named(guide: str, options: Mapping[str, Any]) -> Choice:
     if guide == "none":
         _no_options(options, "`none`")
         return Choice(guide, guide, learns=False, options={})
+    if guide == "auto":
+        _no_options(options, "`auto`")
+        return Choice(guide, guide, learns=True, options={})
     known = registry()
-    parts = guide.split("+")
+    parts = aliases().get(guide, guide).split("+")
     for part in parts:
         if part not in known:
             raise ValueError(
@@ -326,6 +349,9 @@ def _named(guide: str, options: Mapping[str, Any]) -> Choice:
     options_json(options)
     by_part: dict[str, dict[str, Any]] = {part: {} for part in parts}
     for key, value in options.items():
+        if key in by_part and isinstance(value, Mapping):
+            by_part[key] |= value  # as a record has them
+            continue
         owner, dot, option = key.rpartition(".")
         if dot and owner not in by_part:
             raise ValueError(f"`{key}` is an option of `{owner}`, but `guide` is {guide!r}")

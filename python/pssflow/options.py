@@ -18,6 +18,8 @@ from typing import Any
 from .files import first_line
 
 __all__ = [
+    "COMBINATIONS",
+    "DEFAULT_GUIDE",
     "EMITTER_STRATEGIES",
     "MAX_BOUNCES",
     "PARAMETRISATIONS",
@@ -38,6 +40,12 @@ EMITTER_STRATEGIES = ("mis", "nee", "auto")
 
 PASS_KINDS = ("pilot", "guided", "uniform")
 
+COMBINATIONS = ("samples", "variance")
+"""How passes become one image: every sample counts the same, or each pass by its variance."""
+
+DEFAULT_GUIDE = "auto"
+"""Whatever pays, or none."""
+
 MAX_BOUNCES = 32
 MAX_SPP = 1 << 24
 DEFAULT_SPP = 16
@@ -54,11 +62,13 @@ class Preset:
     keep_pilot: bool
     pilot_share: float
     """The pilot's share of the samples."""
+    guide: str
+    """Where none is given."""
 
 
 PRESETS: Mapping[str, Preset] = {
     # Half of the samples teach and are discarded, the other half is drawn from the flow alone.
-    "thesis": Preset("nee", 32, 0.0, keep_pilot=False, pilot_share=0.5),
+    "thesis": Preset("nee", 32, 0.0, keep_pilot=False, pilot_share=0.5, guide="realnvp"),
 }
 """`thesis`: 16 spp of pilot, discarded, then 16 spp learned, NEE alone, no uniform paths. With a = 0 the mean is not
 guaranteed: it reproduces the thesis, and nothing else should use it."""
@@ -76,6 +86,7 @@ class Plan:
     uniform_fraction: float | None
     pilot_spp: int | None
     keep_pilot: bool
+    combine: str
     seed: int
     threads: int
     replay: list[dict[str, Any]] | None
@@ -85,6 +96,7 @@ class Plan:
         cls,
         *,
         learns: bool,
+        may_end_in_none: bool = False,
         spp: int | None = None,
         time: float | None = None,
         k: int = 2,
@@ -93,12 +105,15 @@ class Plan:
         uniform_fraction: float | None = None,
         pilot_spp: int | None = None,
         keep_pilot: bool | None = None,
+        combine: str | None = None,
         seed: int = 0,
         threads: int | None = None,
         preset: str | None = None,
         replay: Sequence[Mapping[str, Any]] | None = None,
     ) -> Plan:
-        """Checks the arguments of a render and fills in defaults; `learns` says whether its guide needs a pilot.
+        """Checks the arguments of a render and fills in defaults.
+
+        `learns` says whether its guide needs a pilot, `may_end_in_none` whether that may be all.
 
         Raises:
             ValueError: one line.
@@ -126,7 +141,8 @@ class Plan:
             pilot_spp = check_integer("pilot_spp", pilot_spp, 1, MAX_SPP)
         elif values is not None and spp is not None and learns:
             pilot_spp = max(int(spp * values.pilot_share), 1)
-        if learns and passes is None and spp is not None and spp < (pilot_spp or 1) + 1:
+        needs_a_pass = learns and not may_end_in_none and passes is None
+        if needs_a_pass and spp is not None and spp < (pilot_spp or 1) + 1:
             raise ValueError(
                 f"`spp` = {spp} leaves no sample for the guide after a pilot of {pilot_spp or 1} spp: "
                 "spp is the total, pilot inside; raise it, or use the guide `none`"
@@ -146,6 +162,7 @@ class Plan:
             uniform_fraction=uniform_fraction,
             pilot_spp=pilot_spp,
             keep_pilot=bool(keep_pilot),
+            combine=check_choice("combine", combine or COMBINATIONS[0], COMBINATIONS),
             seed=check_integer("seed", seed, 0, 2**64 - 1),
             threads=check_threads(threads),
             replay=passes,
@@ -166,6 +183,7 @@ class Plan:
                 "uniform_fraction": self.uniform_fraction,
                 "pilot_spp": self.pilot_spp,
                 "keep_pilot": self.keep_pilot,
+                "combine": self.combine,
                 "seed": self.seed,
                 "threads": self.threads,
             },
@@ -245,7 +263,12 @@ def check_passes(replay: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         kind = check_choice(f"replay[{i}].kind", entry["kind"], PASS_KINDS)
         spp = check_integer(f"replay[{i}].spp", entry["spp"], 1, MAX_SPP)
         record = check_number(f"replay[{i}].record", entry.get("record", 1.0), 0.0, 1.0)
-        checked.append({"kind": kind, "spp": spp, "record": record})
+        told = {"kind": kind, "spp": spp, "record": record, "fit": bool(entry.get("fit", False))}
+        if entry.get("guide") is not None:
+            told["guide"] = str(entry["guide"])
+        if entry.get("a") is not None:
+            told["a"] = check_number(f"replay[{i}].a", entry["a"], 0.0, 1.0)
+        checked.append(told)
     return checked
 
 
@@ -256,6 +279,7 @@ REPLAYED = (
     "emitter_strategy",
     "seed",
     "keep_pilot",
+    "combine",
     "a",
     "guide",
     "guide_options",

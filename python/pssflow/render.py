@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import _core, metrics
-from .guide import Choice, ForeignGuide, Guide, choose
+from .guide import Choice, ForeignGuide, Guide, choose, usual_guide
 from .options import Plan, read_replay
 from .progress import Progress, reporting
 from .scene import Pilot, Scene, SceneLike, Trace
@@ -74,7 +74,7 @@ class Result:
 
 def render(
     scene: SceneLike,
-    guide: str | os.PathLike[str] | Guide | ForeignGuide = "realnvp",
+    guide: str | os.PathLike[str] | Guide | ForeignGuide | None = None,
     spp: int | None = None,
     time: float | None = None,
     k: int = 2,
@@ -91,6 +91,7 @@ def render(
     preset: str | None = None,
     pilot_spp: int | None = None,
     keep_pilot: bool | None = None,
+    combine: str | None = None,
     replay: Replay | None = None,
     **guide_options: Any,
 ) -> Result:
@@ -99,15 +100,16 @@ def render(
     Args:
         scene: a path to a scene's XML file, a dictionary as for `mi.load_dict`, an `mi.Scene` in its current state,
             or a `Scene`, which may be rendered many times. Where no Mitsuba variant is set, loading sets one.
-        guide: `none` for random numbers, a name of `pssflow.guide.registry()` (several joined by `+`), a fitted
-            `Guide` or the path of a saved one (no pilot is spent), or any object with fit, sample and log_prob.
+        guide: `auto` (the default) for the smallest model that pays, or none; `none` for random numbers, a name of
+            `pssflow.guide.registry()` (several joined by `+`) or `table` for all tables, a fitted `Guide` or the path
+            of a saved one (no pilot is spent), or any object with fit, sample and log_prob.
         spp: samples per pixel in all, pilot inside. Default: 16, or the preset's.
         time: seconds in place of `spp`, for pilot, fit and rendering together; loading and the BVH come before. The
             image then depends on the machine's speed; `replay` repeats it.
         k: bounces, 1 … 32.
         parametrisation: what a direction's numbers mean: `bsdf`, `cosine` or `uniform` (hemisphere).
         uniform_fraction: share a of uniform paths in the mixture, in [0, 1]; no path's weight exceeds 1/a. Default:
-            the guide's, 0.25 for flows. At 0 the image may be biased.
+            the guide's, 0.1 for tables and 0.25 for flows, or what `auto` finds best. At 0 the image may be biased.
         seed: of all random numbers; one seed gives one image, bit for bit, on any number of threads.
         threads: None for all cores.
         progress: True for bars on stderr if that is a terminal, "always", False, or a function (phase, share done).
@@ -117,8 +119,11 @@ def render(
         approximate: as in `Scene`, which decides it where one is given: replace what is not supported, with a note.
         preset: `thesis`: NEE alone, a pilot of 16 spp that is discarded, a = 0, then 16 spp from the guide; with
             another `spp`, half for the pilot. What is given beside it wins.
-        pilot_spp: samples per pixel of the pilot. Default: a quarter of `spp`, or a seventh of `time`.
+        pilot_spp: samples per pixel of the pilot. Default: an eighth of `spp` or a tenth of `time` for a guide that
+            later passes refine, a quarter or a seventh for one that is trained once.
         keep_pilot: whether the pilot's paths enter the image. Default: yes.
+        combine: how passes become one image: `samples` (default; every sample counts the same) or `variance` (each pass
+            by its variance, estimated crosswise from halves of the image: less noise, a bias of the order of 1 ÷ spp).
         replay: the record of an earlier run (`Result.stats` or the command's JSON file), whose guide, settings, seed
             and passes are repeated, or only its `passes`.
         **guide_options: the guide's own, as `epochs=7`; in a composite also `**{"realnvp.epochs": 7}`.
@@ -145,6 +150,7 @@ def render(
         "emitter_strategy": emitter_strategy,
         "uniform_fraction": uniform_fraction,
         "keep_pilot": keep_pilot,
+        "combine": combine,
         "seed": seed,
     }
     if replay is not None:
@@ -152,9 +158,10 @@ def render(
             raise ValueError("`replay` repeats recorded passes; leave out `spp` and `time`")
         if isinstance(replay, (str, os.PathLike, Mapping)):
             guide, guide_options, replay = _replayed(read_replay(replay), guide, settings)
-    choice = choose(guide, guide_options)
+    choice = choose(usual_guide(preset) if guide is None else guide, guide_options)
     plan = Plan.make(
         learns=choice.learns,
+        may_end_in_none=choice.kind == "auto",
         spp=spp,
         time=time,
         pilot_spp=pilot_spp,
@@ -226,8 +233,8 @@ def _replayed(
 
     A record knows a foreign object's class only, so that object must be given again.
     """
-    names = ("k", "parametrisation", "emitter_strategy", "keep_pilot", "seed")
+    names = ("k", "parametrisation", "emitter_strategy", "keep_pilot", "combine", "seed")
     settings.update({name: record[name] for name in names}, uniform_fraction=record["a"])
-    if isinstance(guide, (str, os.PathLike)):
+    if guide is None or isinstance(guide, (str, os.PathLike)):
         guide = record["guide"]
     return guide, dict(record["guide_options"]), list(record["passes"])

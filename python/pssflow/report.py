@@ -16,6 +16,8 @@ from .render import Result
 from .thesis import ThesisScene
 
 __all__ = [
+    "candidates_table",
+    "choice_line",
     "compare_picture",
     "count",
     "gain",
@@ -69,6 +71,38 @@ def runs_table(runs: Sequence[Mapping[str, Any]], thesis: ThesisScene | None = N
             cells.append(number(run["variance"]))
         cells += [number(run["max_weight"], 3), number(run["max_contribution"], 3)]
         shown.add_row(*cells)
+    return shown
+
+
+def choice_line(run: Mapping[str, Any]) -> str:
+    """What `auto` chose and why, in a line."""
+    chosen = next(c for c in run["candidates"] if c["chosen"])
+    if chosen["name"] == "none":
+        return f"auto: none; {chosen['why']}"
+    return (
+        f"auto: {chosen['name']} at a = {chosen['a']:.2g}; predicted gain {chosen['predicted_gain']:.3g}, "
+        f"{chosen['net_gain']:.3g} after its cost: {chosen['why']}"
+    )
+
+
+def candidates_table(run: Mapping[str, Any]) -> Table:
+    """What `auto` considered last, the best first; empty where there was nothing to choose."""
+    shown = Table(title="what auto considered")
+    shown.add_column("candidate")
+    for heading in ("a", "predicted gain", "cost", "training", "net gain"):
+        shown.add_column(heading, justify="right")
+    shown.add_column("why")
+    for candidate in run["candidates"] or ():
+        shown.add_row(
+            candidate["name"],
+            number(candidate["a"], 2),
+            number(candidate["predicted_gain"], 3),
+            percent(candidate["cost_ratio"]),
+            percent(candidate["training_share"]),
+            number(candidate["net_gain"], 3),
+            candidate["why"],
+            style="bold" if candidate["chosen"] else None,
+        )
     return shown
 
 

@@ -299,7 +299,7 @@ class Scene:
             scene_hash=self.hash,
         )
 
-    def render(self, guide: Any = "realnvp", spp: int | None = None, **options: Any) -> Result:
+    def render(self, guide: Any = None, spp: int | None = None, **options: Any) -> Result:
         """Renders this scene; arguments as in `pssflow.render`."""
         from .render import render
 

@@ -114,7 +114,7 @@ def test_the_xml_snippet_renders(variant: str, tmp_path: Path) -> None:
     assert image.mean() > 0
     result = loaded.integrator().result
     assert isinstance(result, pssflow.Result)
-    assert (result.stats["guide"], result.stats["k"]) == ("realnvp", 2)
+    assert (result.stats["guide"], result.stats["k"]) == ("auto", 2)
 
 
 @pytest.mark.parametrize("document", DOCUMENTS)

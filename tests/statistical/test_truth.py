@@ -328,6 +328,52 @@ def test_learned_numbers_give_mitsubas_mean(
     assert r.has_power, r.explain(artifacts)
 
 
+TABLES = ("direction-table", "emitter-table", "light-table", "table", "auto")
+
+
+def _table_cases() -> list[Any]:
+    """One emitter, two, 36, a sky, a sky and a sun; the quick tier takes one of each kind."""
+    quick = {
+        ("cornell-box", "table", 0.1, 2, "mis"),
+        ("glossy_room", "table", 0.1, 2, "mis"),
+        ("open_sky", "table", 0.5, 2, "mis"),
+        ("sun_and_sky", "table", 0.1, 3, "mis"),
+        ("sun_and_sky", "auto", 0.1, 2, "nee"),
+        ("glass_room", "auto", 0.1, 2, "mis"),
+    }
+    scenes = ("cornell-box", "glossy_room", "open_sky", "sun_and_sky", "glass_room", "many-lights")
+    cases = []
+    for case in product(scenes, TABLES, (0.1, 0.5), (2, 3), ("mis", "nee")):
+        name, _, a, k, strategy = case
+        if strategy == "nee" and (name in BLIND or (a, k) != (0.1, 2)):
+            continue
+        marks = [] if case in quick else [pytest.mark.long]
+        cases.append(pytest.param(*case, marks=marks, id="-".join(map(str, case))))
+    assert sum(not case.marks for case in cases) == len(quick)
+    return cases
+
+
+@pytest.mark.parametrize(("name", "guide", "a", "k", "strategy"), _table_cases())
+def test_tables_give_mitsubas_mean(
+    name: str, guide: str, a: float, k: int, strategy: str, artifacts: Path, record
+) -> None:
+    """H0: tables that are refined from pass to pass have the truth as mean, all passes kept."""
+    options = {"guide": guide, "uniform_fraction": a, "emitter_strategy": strategy, "k": k}
+    r = welch(_truth(name, k), _ours(name, **options))
+    record |= {"p": r.p, "largest sample's share": max(r.heaviest)}
+    assert r.p > ALPHA / 2, r.explain(artifacts)
+    assert r.has_power or strategy == "nee", r.explain(artifacts)
+
+
+@pytest.mark.parametrize("k", [2, 3, 4])
+@pytest.mark.parametrize("a", [0.1, 0.5])
+def test_no_weight_exceeds_one_over_a(k: int, a: float) -> None:
+    """One coin a path: however many numbers are guided, 1/m ≤ 1/a."""
+    result = render(_core_of("sun_and_sky"), guide="table", k=k, uniform_fraction=a, spp=32)
+    weight = result["record"]["max_weight"]
+    assert 1.0 < weight <= 1.0 / a * (1.0 + 1e-6)
+
+
 @pytest.mark.parametrize("strategy", ["mis", pytest.param("nee", marks=pytest.mark.long)])
 def test_the_mixture_alone_gives_mitsubas_mean(strategy: str, artifacts: Path) -> None:
     """H0: as above without the pilot in the image, whose uniform paths would water a bias down."""

@@ -142,12 +142,32 @@ def test_all_kinds_of_scenes_are_one(scalar_variant):
 
 def test_defaults(furnace):
     stats = furnace.render(progress=False).stats
-    assert (stats["guide"], stats["k"], stats["a"]) == ("realnvp", 2, 0.25)
+    assert (stats["guide"], stats["k"], stats["combine"]) == ("auto", 2, "samples")
     assert (stats["parametrisation"], stats["emitter_strategy"]) == ("bsdf", "mis")
-    assert [(entry["kind"], entry["spp"]) for entry in stats["passes"]] == [
-        ("pilot", 4),
-        ("guided", 12),
-    ]
+    assert [entry["spp"] for entry in stats["passes"]] == [2, 2, 4, 8]
+    assert stats["passes"][0]["kind"] == "pilot"
+    assert sum(candidate["chosen"] for candidate in stats["candidates"]) == 1
+
+
+def test_a_preset_has_a_guide_of_its_own(furnace):
+    stats = furnace.render(spp=4, preset="thesis", progress=False).stats
+    assert (stats["guide"], stats["a"]) == ("realnvp", 0.0)
+
+
+@pytest.mark.parametrize("combine", ["samples", "variance"])
+@pytest.mark.parametrize("guide", ["table", "emitter-table+direction-table", "auto"])
+def test_tables_render_and_repeat(furnace, guide, combine):
+    first = furnace.render(guide, 16, seed=3, combine=combine, threads=1, progress=False)
+    again = furnace.render(guide, 16, seed=3, combine=combine, threads=3, progress=False)
+    np.testing.assert_array_equal(first.image, again.image)
+    assert sum(entry["spp"] for entry in first.stats["passes"]) == 16
+    replayed = pssflow.render(furnace, replay=first.stats, progress=False)
+    np.testing.assert_array_equal(first.image, replayed.image)
+
+
+def test_auto_may_end_in_its_pilot(furnace):
+    stats = furnace.render("auto", 1, progress=False).stats
+    assert (stats["chosen"], [entry["spp"] for entry in stats["passes"]]) == ("none", [1])
 
 
 def test_one_seed_one_image(furnace):
@@ -508,7 +528,7 @@ def test_what_guide_means():
         ({"guide": "realnvp", "spp": 4, "pilot_spp": 4}, "leaves no sample for the guide"),
         (
             {"guide": "vegasse"},
-            "`guide` = 'vegasse' is unknown .known: none, realnvp, realnvp-logit",
+            "`guide` = 'vegasse' is unknown .known: none, auto, realnvp, realnvp-logit",
         ),
         ({"guide": "realnvp", "epoch": 3}, "epoch"),
         ({"guide": "realnvp", "epochs": -3}, "epochs"),

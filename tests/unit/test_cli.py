@@ -191,7 +191,7 @@ CASES = [
     Case("unknown variant", "render good.xml -o out.exr --variant scalar", "scalar_rgb, llvm_ad_rgb"),
     Case("spp 0", RENDER + "--spp 0", "0 is not in the range"),
     Case("spp and time", RENDER + "--spp 4 --time 1", "both given"),
-    Case("too few for a pilot", RENDER + "--spp 1", "`spp` = 1"),
+    Case("too few for a pilot", RENDER + "--guide realnvp --spp 1", "`spp` = 1"),
     Case("negative time", RENDER + "--time -1", "'-1' is no number of seconds"),
     Case("NaN seconds", RENDER + "--time nan", "'nan' is no number of seconds"),
     Case("k 0", RENDER + "--k 0", "0 is not in the range"),
@@ -338,8 +338,9 @@ def test_render_writes_image_variance_and_record(command, tmp_path):
 
 def test_json_is_one_object_alone_on_stdout(command):
     outcome = command(
-        "render", CORNELL, "-o", "out.exr", "--spp", 8, *TINY, "--json", "--set", "realnvp.epochs=1"
-    )
+        "render", CORNELL, "-o", "out.exr", "--spp", 8, *TINY, "--json",
+        "--guide", "realnvp", "--set", "realnvp.epochs=1",
+    )  # fmt: skip
     assert outcome.code == 0, outcome.err
     assert outcome.out.count("\n") == 1
     run = json.loads(outcome.out)
@@ -350,29 +351,32 @@ def test_json_is_one_object_alone_on_stdout(command):
     assert run["relmse"] is None
 
 
-def test_replay_repeats_a_run_bit_for_bit(command):
-    first = command(
-        "render",
-        CORNELL,
-        "-o",
-        "a.exr",
-        "--spp",
-        8,
-        *TINY,
-        "--seed",
-        5,
-        "--set",
-        "realnvp.epochs=1",
-        "-q",
-    )
+@pytest.mark.parametrize("guide", ["realnvp", "table", "auto"])
+def test_replay_repeats_a_run_bit_for_bit(guide, command):
+    setting = ("--set", "realnvp.epochs=1") if guide == "realnvp" else ()
+    arguments = ("--guide", guide, "--spp", 8, *TINY, "--seed", 5, *setting, "-q")
+    first = command("render", CORNELL, "-o", "a.exr", *arguments)
     assert first.code == 0, first.err
     second = command("render", CORNELL, "-o", "b.exr", *TINY, "--replay", "a.json", "--threads", 1)
     assert second.code == 0, second.err
     np.testing.assert_array_equal(pixels(Path("a.exr")), pixels(Path("b.exr")))
 
 
-def test_a_saved_guide_is_used_again_and_refused_elsewhere(command):
-    command("render", CORNELL, "-o", "a.exr", "--spp", 8, *TINY, "--save-guide", "g.safetensors")
+def test_auto_says_why(command):
+    arguments = ("render", CORNELL, "-o", "a.exr", "--spp", 16, *TINY)
+    plain, explained = command(*arguments), command(*arguments, "--explain")
+    assert "auto: " in plain.out
+    assert "what auto considered" in explained.out
+    assert "direction-table" in explained.out
+
+
+@pytest.mark.parametrize(
+    ("guide", "chosen"),
+    [("realnvp", "realnvp"), ("table", "direction-table+emitter-table+light-table")],
+)
+def test_a_saved_guide_is_used_again_and_refused_elsewhere(guide, chosen, command):
+    learned = ("--guide", guide, "--save-guide", "g.safetensors")
+    command("render", CORNELL, "-o", "a.exr", "--spp", 8, *TINY, *learned)
     again = command(
         "render",
         CORNELL,
@@ -387,7 +391,7 @@ def test_a_saved_guide_is_used_again_and_refused_elsewhere(command):
     )
     assert again.code == 0, again.err
     run = json.loads(again.out)
-    assert run["chosen"] == "realnvp"
+    assert run["chosen"] == chosen
     assert run["pilot"]["camera_rays"] == 0
     assert run["camera_rays"] == 4 * 16 * 16
     # Another number of bounces has other columns, another film size is another scene.

@@ -10,7 +10,7 @@ Learned light of exactly k bounces (:monosp:`pssflow`)
  * - guide
    - |string|
    - What chooses the random numbers: ``none``, a guide's name (several joined by ``+``), or the path of a saved guide.
-     (Default: ``realnvp``)
+     (Default: ``auto``; with the preset ``thesis``, ``realnvp``)
  * - k
    - |int|
    - Bounces between camera and light, 1 … 32. (Default: 2)
@@ -114,6 +114,7 @@ PARAMETERS: tuple[str, ...] = (
     "uniform_fraction",
     "pilot_spp",
     "keep_pilot",
+    "combine",
     "preset",
     "seed",
 )
@@ -131,7 +132,7 @@ def define() -> Callable[[Any], Any]:
             # warn, and construct plugins in several threads.
             with quiet() if is_scalar() else nullcontext():
                 super().__init__(props)
-            guide = str(props.get("guide", "realnvp"))
+            guide = str(props.get("guide", guides.usual_guide(props.get("preset", None))))
             if guides.is_path(guide):
                 # As every file that a scene names: relative to the scene's own folder.
                 resolver: Any = mi.file_resolver
@@ -198,7 +199,8 @@ def define() -> Callable[[Any], Any]:
                 arguments["spp"] = sample_count
             if seed:
                 arguments["seed"] = seed
-            return Plan.make(learns=self.choice.learns, **arguments)
+            auto = self.choice.kind == "auto"
+            return Plan.make(learns=self.choice.learns, may_end_in_none=auto, **arguments)
 
     return PssflowIntegrator
 
@@ -210,7 +212,7 @@ def _guide_options(props: Any, guide: str) -> dict[str, Any]:
     """The options of the guides in use. Those of others are not read: Mitsuba lists them as unreferenced."""
     options: dict[str, Any] = {}
     known = guides.registry()
-    for part in guide.split("+"):
+    for part in guides.aliases().get(guide, guide).split("+"):
         prefix = part.replace("-", "_") + "_"
         for option in known.get(part, {}).get("options", ()):
             if prefix + option in props:

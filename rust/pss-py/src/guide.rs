@@ -199,6 +199,16 @@ pub(crate) fn parse_options(options: &str) -> PyResult<Map<String, Value>> {
     })
 }
 
+/// Names that stand for several guides, JSON: {name: guides joined by `+`}.
+#[pyfunction]
+pub(crate) fn guide_aliases() -> String {
+    let pairs = pss_guide::ALIASES.iter();
+    let map: Map<String, Value> = pairs
+        .map(|&(alias, guides)| (alias.to_owned(), guides.into()))
+        .collect();
+    Value::from(map).to_string()
+}
+
 /// The registry, JSON.
 #[pyfunction]
 pub(crate) fn guides() -> String {

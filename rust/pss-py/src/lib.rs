@@ -22,7 +22,7 @@ static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 #[pymodule]
 mod _core {
     #[pymodule_export]
-    use super::guide::{Guide, guides};
+    use super::guide::{Guide, guide_aliases, guides};
     #[pymodule_export]
     use super::output::write_exr;
     #[pymodule_export]

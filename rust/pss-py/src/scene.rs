@@ -7,7 +7,7 @@ use std::sync::{Arc, OnceLock};
 use numpy::PyReadonlyArray2;
 use pss_render::math::Rgb;
 use pss_render::{Columns, EmitterStrategy, Parametrisation, Paths, Tracer};
-use pssflow::{Budget, GuideChoice, Learner, Options, Outcome, PassPlan};
+use pssflow::{Auto, Budget, Combine, GuideChoice, Named, Options, Outcome, PassPlan};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use serde::Deserialize;
@@ -52,30 +52,10 @@ struct Request {
     uniform_fraction: Option<f32>,
     pilot_spp: Option<u32>,
     keep_pilot: bool,
+    #[serde(default)]
+    combine: Combine,
     seed: u64,
     threads: usize,
-}
-
-/// A guide of the registry, or several, with options.
-struct Named(pss_guide::Recipe);
-
-impl Learner for Named {
-    fn name(&self) -> &str {
-        self.0.name()
-    }
-
-    fn seconds_per_path(&self, dims: usize) -> f64 {
-        self.0.seconds_per_path(dims)
-    }
-
-    fn fit(
-        &self,
-        records: &pss_guide::Records<'_>,
-        seed: u64,
-        progress: &mut dyn FnMut(f32) -> bool,
-    ) -> Result<pss_guide::Fit, pss_guide::GuideError> {
-        self.0.fit(records, seed, progress)
-    }
 }
 
 pub(crate) fn parametrisation(name: &str) -> PyResult<Parametrisation> {
@@ -375,6 +355,10 @@ impl Scene {
         };
         match request.guide.as_str() {
             "none" => Ok(GuideChoice::None),
+            "auto" => {
+                let auto = Auto::new().map_err(errors::guide)?;
+                Ok(GuideChoice::Auto(Arc::new(auto)))
+            }
             "ready" => {
                 let guide = given()?.extract::<PyRef<'_, Guide>>()?;
                 Ok(GuideChoice::Ready(Arc::clone(&guide.inner)))
@@ -387,7 +371,7 @@ impl Scene {
             name => {
                 // Before minutes of pilot, not after.
                 let recipe = pss_guide::Recipe::parse(name, &request.guide_options);
-                Ok(GuideChoice::Learn(Arc::new(Named(
+                Ok(GuideChoice::Learn(Arc::new(Named::new(
                     recipe.map_err(errors::guide)?,
                 ))))
             }
@@ -410,11 +394,10 @@ impl Scene {
             parametrisation: parametrisation(&request.parametrisation)?,
             strategy: strategy(&request.emitter_strategy)?,
             budget,
-            uniform_fraction: request
-                .uniform_fraction
-                .unwrap_or(defaults.uniform_fraction),
+            uniform_fraction: request.uniform_fraction,
             pilot_spp: request.pilot_spp,
             keep_pilot: request.keep_pilot,
+            combine: request.combine,
             seed: request.seed,
             threads: request.threads,
             max_records: defaults.max_records,
@@ -443,6 +426,8 @@ fn record(outcome: &Outcome, options: &Options) -> Value {
         "max_contribution": outcome.in_image.max_contribution(),
         "ess": outcome.in_image.ess(),
         "passes": outcome.passes,
+        "combine": options.combine.name(),
+        "candidates": outcome.candidates,
         "notes": outcome.notes,
         "training": outcome.training,
         "seconds": outcome.seconds,

@@ -48,6 +48,11 @@ impl Discrete {
         self.cdf.is_empty()
     }
 
+    /// Upper ends of the items' intervals of [0, 1), the last one 1.
+    pub fn bounds(&self) -> &[f32] {
+        &self.cdf
+    }
+
     /// Probability of item `i`.
     #[inline]
     pub fn probability(&self, i: usize) -> f32 {

@@ -325,25 +325,55 @@ impl Accumulator {
 
     /// Adds another accumulator's sums; where they overlap, in the caller's order.
     pub fn merge(&mut self, other: &Self) {
+        self.merge_weighted(other, |_, _| 1.0);
+    }
+
+    /// Adds another accumulator's sums, the samples of each pixel (column, row) with one more weight.
+    pub fn merge_weighted(&mut self, other: &Self, weight: impl Fn(u32, u32) -> f64) {
         let b = other.tile;
         for row in 0..b.height {
             for column in 0..b.width {
-                let i = self.index(b.x + column, b.y + row);
-                let j = (row * b.width + column) as usize;
+                let (x, y) = (b.x + column, b.y + row);
+                let (i, j) = (self.index(x, y), (row * b.width + column) as usize);
+                let w = weight(x, y);
                 for c in 0..2 {
                     self.counts[i][c] += other.counts[j][c];
                 }
                 let (to, from) = (&mut self.sums[i], &other.sums[j]);
-                to.weight += from.weight;
-                to.weight_2 += from.weight_2;
-                to.weight_3 += from.weight_3;
+                to.weight += w * from.weight;
+                to.weight_2 += w * w * from.weight_2;
+                to.weight_3 += w * w * w * from.weight_3;
                 for c in 0..3 {
-                    to.value[c] += from.value[c];
-                    to.value_w2[c] += from.value_w2[c];
-                    to.square_w2[c] += from.square_w2[c];
+                    to.value[c] += w * from.value[c];
+                    to.value_w2[c] += w * w * from.value_w2[c];
+                    to.square_w2[c] += w * w * from.square_w2[c];
                 }
             }
         }
+    }
+
+    /// Variance of one of these samples relative to `mean`² + `epsilon`, averaged over the pixels (column, row)
+    /// `inside` and the channels. `mean` is the image as it is known best, so that one sample a pixel will do.
+    pub fn relative_spread(
+        &self,
+        mean: &Developed,
+        epsilon: f64,
+        inside: impl Fn(u32, u32) -> bool,
+    ) -> f64 {
+        let (mut sum, mut n) = (0.0, 0u64);
+        for (i, s) in self.sums.iter().enumerate() {
+            let (x, y) = (i as u32 % self.tile.width, i as u32 / self.tile.width);
+            if s.weight_2 <= 0.0 || !inside(self.tile.x + x, self.tile.y + y) {
+                continue;
+            }
+            for c in 0..3 {
+                let m = f64::from(mean.image[3 * i + c]);
+                let square = s.square_w2[c] - 2.0 * m * s.value_w2[c] + m * m * s.weight_2;
+                sum += square / s.weight_2 / (m * m + epsilon);
+                n += 1;
+            }
+        }
+        sum / n.max(1) as f64
     }
 
     /// Mean, variance of the mean, and counts.

@@ -28,7 +28,7 @@ pub struct VertexContext {
 pub struct Lanes<'a> {
     /// Rows of `u` and `q` that are alive.
     pub active: &'a [u32],
-    /// One context an active path, if [`NumberSource::looks_at_vertices`]; else empty.
+    /// One context an active path, if [`NumberSource::looks_at`] this decision's; else empty.
     pub contexts: &'a [VertexContext],
     /// Primary numbers, `width` a path; uniform in this decision's columns until replaced.
     pub u: &'a mut [f32],
@@ -46,8 +46,8 @@ pub trait NumberSource {
     /// (with respect to uniform numbers) into `lanes.q`. Numbers left alone have density 1.
     fn decide(&mut self, decision: Decision, lanes: Lanes<'_>);
 
-    /// Whether contexts are wanted.
-    fn looks_at_vertices(&self) -> bool {
+    /// Whether contexts are wanted for a decision; those of the whole path know the pixel alone.
+    fn looks_at(&self, _decision: Decision) -> bool {
         false
     }
 }

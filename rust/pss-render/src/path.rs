@@ -148,7 +148,7 @@ impl<'a> Tracer<'a> {
             return;
         }
         paths.stage_contexts.clear();
-        if numbers.looks_at_vertices() {
+        if numbers.looks_at(decision) {
             let bounce = match decision {
                 Decision::Path => 0,
                 Decision::Direction(b) => b,

@@ -180,6 +180,11 @@ impl Paths {
         self.states.iter().map(|s| s.emitter)
     }
 
+    /// The emitter that path `i` of a traced block chose.
+    pub fn emitter(&self, i: usize) -> u32 {
+        self.states[i].emitter
+    }
+
     pub(crate) fn reset(&mut self) {
         let n = self.film.len();
         self.f_nee.clear();

@@ -293,6 +293,14 @@ impl Scene {
         &self.environments
     }
 
+    /// Per emitter: the upper end of its interval of the emitter's number, and whether it surrounds the scene.
+    pub fn emitter_intervals(&self) -> impl Iterator<Item = (f32, bool)> + '_ {
+        let bounds = self.emitter_choice.bounds().iter();
+        bounds
+            .zip(&self.emitters)
+            .map(|(&end, emitter)| (end, emitter.model().is_environment()))
+    }
+
     /// The choice of an emitter by its sampling weight.
     pub fn emitter_choice(&self) -> &Discrete {
         &self.emitter_choice

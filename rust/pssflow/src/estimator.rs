@@ -3,15 +3,18 @@
 use std::sync::Arc;
 use std::time::Instant;
 
-use pss_guide::{Guide, GuideError, Records};
+use pss_guide::{Emitter, Guide};
 use pss_render::{Accumulator, Developed, Scene, Tracer};
 use serde::Serialize;
 
+use crate::combine::by_variance;
 use crate::error::RenderError;
+use crate::learning::Current;
 use crate::mixture::Mixture;
-use crate::options::{Budget, GuideChoice, Options, PassKind, PassPlan};
-use crate::pass::{Pass, PassContext, PilotRecords};
+use crate::options::{Budget, Combine, Options, PassKind, PassPlan};
+use crate::pass::{Pass, PassContext};
 use crate::progress::{Phase, Progress};
+use crate::records::PathRecords;
 use crate::statistics::Statistics;
 
 /// Wall time by phase.
@@ -40,6 +43,8 @@ pub struct Outcome {
     pub chosen: String,
     /// Why it was not the one asked for, or what else is worth knowing.
     pub notes: Vec<String>,
+    /// What a chooser considered last, and why it was taken or not; null where there was nothing to choose.
+    pub candidates: serde_json::Value,
     /// What the guide's training reported, JSON.
     pub training: serde_json::Value,
     /// Share of uniform paths that it was mixed with.
@@ -87,16 +92,6 @@ impl Outcome {
     }
 }
 
-/// Share of a time budget that the pilot may take.
-const PILOT_TIME: f64 = 1.0 / 7.0;
-/// Under `--spp`, one sample in so many is the pilot's.
-const PILOT_DIVISOR: u32 = 4;
-
-/// Share of a time budget that training is planned to take; what takes longer than the whole is given up.
-const TRAINING_TIME: f64 = 0.3;
-/// Samples per pixel that a timed pilot's memory for records is planned for.
-const TIMED_PILOT_SPP: u32 = 64;
-
 /// Renders the k-bounce indirect light of `scene`.
 ///
 /// With [`Budget::Spp`] or [`Budget::Replay`], one seed gives one image, bit for bit, for any number of
@@ -118,42 +113,33 @@ pub fn render(
         progress,
         pool: &pool,
     };
+    let intervals = scene.emitter_intervals();
     let mut run = Run {
         context,
         options,
         clock: Instant::now(),
         image: Accumulator::whole(scene.film()),
+        apart: Vec::new(),
         next_sample: 0,
+        records: PathRecords::default(),
+        emitters: intervals
+            .map(|(cdf, environment)| Emitter { cdf, environment })
+            .collect(),
+        current: Current::default(),
+        drawn: None,
         passes: Vec::new(),
         pilot: Statistics::default(),
         rendered: Statistics::default(),
         seconds: Seconds::default(),
         notes: Vec::new(),
-        training: serde_json::Value::Null,
     };
-
-    let guide = match &options.guide {
-        GuideChoice::Learn(learner) => {
-            let dims = run.context.tracer.columns().learned();
-            let records = run.pilot(learner.seconds_per_path(dims))?;
-            run.fit(learner.as_ref(), &records)?
-        }
-        ready => {
-            // A recorded pilot is part of the image, also where its guide is at hand already.
-            if matches!(options.budget, Budget::Replay(_)) {
-                run.pilot(0.0)?;
-            }
-            match ready {
-                GuideChoice::Ready(guide) => Some(Arc::clone(guide)),
-                _ => None,
-            }
-        }
-    };
-    if let Some(guide) = &guide {
-        run.check_dimensions(guide.as_ref())?;
+    run.take_ready()?;
+    match &options.budget {
+        Budget::Spp(spp) => run.by_samples(*spp)?,
+        Budget::Time(time) => run.by_time(*time)?,
+        Budget::Replay(passes) => run.by_record(passes)?,
     }
-    run.paths(guide.as_deref())?;
-    Ok(run.finish(guide))
+    Ok(run.finish())
 }
 
 pub(crate) fn thread_pool(threads: usize) -> Result<rayon::ThreadPool, RenderError> {
@@ -167,307 +153,127 @@ pub(crate) fn thread_pool(threads: usize) -> Result<rayon::ThreadPool, RenderErr
         })
 }
 
-/// A render under way.
-struct Run<'a> {
-    context: PassContext<'a>,
-    options: &'a Options,
-    clock: Instant,
+/// A render under way: `schedule` cuts the budget into passes, `learning` fits guides between them.
+pub(crate) struct Run<'a> {
+    pub(crate) context: PassContext<'a>,
+    pub(crate) options: &'a Options,
+    pub(crate) clock: Instant,
+    /// Sums of the passes; with weights by variance, of none.
     image: Accumulator,
-    next_sample: u32,
-    passes: Vec<PassPlan>,
-    pilot: Statistics,
+    /// Sums of each pass, where these are weighted by variance.
+    apart: Vec<Accumulator>,
+    /// Samples per pixel so far.
+    pub(crate) next_sample: u32,
+    pub(crate) records: PathRecords,
+    pub(crate) emitters: Vec<Emitter>,
+    pub(crate) current: Current,
+    /// The guide of the last guided pass, its name and its share of uniform paths.
+    drawn: Option<(Arc<dyn Guide>, String, f32)>,
+    pub(crate) passes: Vec<PassPlan>,
+    pub(crate) pilot: Statistics,
     rendered: Statistics,
-    seconds: Seconds,
+    pub(crate) seconds: Seconds,
     notes: Vec<String>,
-    training: serde_json::Value,
 }
 
 impl Run<'_> {
-    /// Random paths; they stay in the image unless the preset discards them.
-    fn pilot(&mut self, seconds_per_path: f64) -> Result<PilotRecords, RenderError> {
-        let start = Instant::now();
-        let mut records = PilotRecords::default();
-        match (self.options.budget.clone(), self.options.pilot_spp) {
-            (Budget::Replay(passes), _) => {
-                let pilots = passes.iter().filter(|p| p.kind == PassKind::Pilot);
-                let total: u32 = pilots.clone().map(|p| p.spp).sum();
-                let mut done = 0;
-                for pass in pilots {
-                    let share = |n: u32| n as f32 / total as f32;
-                    let span = (share(done), share(done + pass.spp));
-                    self.pilot_pass(pass.spp, pass.record, span, &mut records)?;
-                    done += pass.spp;
-                }
-            }
-            (Budget::Spp(_), Some(spp)) => {
-                self.pilot_pass(spp, self.record_share(spp), (0.0, 1.0), &mut records)?;
-            }
-            (Budget::Spp(spp), None) => {
-                let spp = (spp / PILOT_DIVISOR).max(1);
-                self.pilot_pass(spp, self.record_share(spp), (0.0, 1.0), &mut records)?;
-            }
-            (Budget::Time(time), spp) => {
-                self.timed_pilot(time, spp, seconds_per_path, &mut records)?;
-            }
-        }
-        self.seconds.pilot = start.elapsed().as_secs_f64();
-        Ok(records)
-    }
-
-    /// One sample a pixel, then as many more as its measured speed allows (or as were asked for), of which no
-    /// more paths are kept than the guide can be trained on in its share of the time.
-    fn timed_pilot(
+    /// Renders a pass, keeps a share of its paths for training, and notes it.
+    pub(crate) fn pass(
         &mut self,
-        time: f64,
-        spp: Option<u32>,
-        seconds_per_path: f64,
-        records: &mut PilotRecords,
-    ) -> Result<(), RenderError> {
-        let start = Instant::now();
-        let pixels = self.context.tracer.scene().film().pixels() as f64;
-        let affordable = time * TRAINING_TIME / seconds_per_path.max(f64::MIN_POSITIVE);
-        // How many paths carry light is not known yet; a quarter of all is on the high side.
-        let first = (4.0 * affordable / pixels).min(1.0) as f32;
-        let first = first.min(self.record_share(TIMED_PILOT_SPP));
-        self.pilot_pass(1, first, (0.0, 0.1), records)?;
-        let each = start.elapsed().as_secs_f64();
-        let more = match spp {
-            Some(spp) => spp - 1,
-            None => ((time * PILOT_TIME - each) / each).clamp(0.0, f64::from(1 << 20)) as u32,
-        };
-        if more == 0 {
-            return Ok(());
-        }
-        let nonzero = self.pilot.counts.nonzero as f64 * f64::from(more);
-        let left = (affordable - records.f.len() as f64).max(0.0);
-        let record = (left / nonzero.max(1.0)).min(1.0) as f32;
-        let record = record.min(self.record_share(more.max(TIMED_PILOT_SPP)));
-        self.pilot_pass(more, record, (0.1, 1.0), records)
-    }
-
-    /// Share of the light-carrying paths to keep so that a pilot of `spp` fits the memory for records, even
-    /// if every path carries light. At random, since every other rule would prefer a part of the image.
-    fn record_share(&self, spp: u32) -> f32 {
-        let paths = self.context.tracer.scene().film().pixels() as f64 * f64::from(spp);
-        (self.options.max_records as f64 / paths).min(1.0) as f32
-    }
-
-    fn pilot_pass(
-        &mut self,
+        kind: PassKind,
         spp: u32,
         record: f32,
         span: (f32, f32),
-        records: &mut PilotRecords,
     ) -> Result<(), RenderError> {
+        let start = Instant::now();
+        let film = self.context.tracer.scene().film();
+        let pilot = kind == PassKind::Pilot;
+        let guide = self
+            .current
+            .guide
+            .clone()
+            .filter(|_| kind == PassKind::Guided);
+        let mixture = Mixture {
+            uniform_fraction: self.current.uniform_fraction,
+        };
+        let record = if self.options.guide.learns() {
+            record
+        } else {
+            0.0
+        };
         let pass = Pass {
-            phase: Phase::Pilot,
+            phase: if pilot { Phase::Pilot } else { Phase::Render },
             first_sample: self.next_sample,
             spp,
-            guide: None,
+            guide: guide.as_deref().map(|g| (g, mixture)),
             record,
+            contexts: self.options.guide.looks_at_contexts(),
             span,
         };
-        let mut discarded;
-        let image = if self.options.keep_pilot {
-            &mut self.image
+        let discarded = pilot && !self.options.keep_pilot;
+        let mut own = None;
+        let image = if discarded || self.options.combine == Combine::Variance {
+            own.insert(Accumulator::whole(film))
         } else {
-            discarded = Accumulator::whole(self.context.tracer.scene().film());
-            &mut discarded
+            &mut self.image
         };
         let mut result = self.context.render(&pass, image)?;
-        let zeros = result.statistics.counts.camera_rays - result.statistics.counts.nonzero;
-        result.records.zeros = (zeros as f64 * f64::from(record)) as u64;
-        records.append(&mut result.records);
-        self.pilot.add(&result.statistics);
+        self.apart.extend(own.filter(|_| !discarded));
+        if record > 0.0 {
+            result.records.count(result.statistics.counts.camera_rays);
+            self.records.append(&mut result.records);
+        }
         self.next_sample += spp;
+        let seconds = start.elapsed().as_secs_f64();
+        if pilot {
+            self.pilot.add(&result.statistics);
+            self.seconds.pilot += seconds;
+        } else {
+            self.rendered.add(&result.statistics);
+            self.seconds.render += seconds;
+        }
+        let guided = guide.is_some();
+        let fresh = std::mem::take(&mut self.current.fresh);
         self.passes.push(PassPlan {
-            kind: PassKind::Pilot,
+            kind: match kind {
+                PassKind::Guided if !guided => PassKind::Uniform,
+                kind => kind,
+            },
             spp,
             record,
+            guide: guided.then(|| self.current.name.clone()),
+            a: guided.then_some(mixture.uniform_fraction),
+            fit: guided && fresh,
         });
-        Ok(())
-    }
-
-    /// Learns from the pilot. `None`, with a note, where there is nothing to learn from or no time left.
-    fn fit(
-        &mut self,
-        learner: &dyn crate::options::Learner,
-        records: &PilotRecords,
-    ) -> Result<Option<Arc<dyn Guide>>, RenderError> {
-        let replayed_without = matches!(&self.options.budget, Budget::Replay(passes)
-            if !passes.iter().any(|p| p.kind == PassKind::Guided));
-        if replayed_without {
-            return Ok(None);
-        }
-        let start = Instant::now();
-        let deadline = match self.options.budget {
-            Budget::Time(time) => time,
-            _ => f64::INFINITY,
-        };
-        let (clock, progress) = (self.clock, self.context.progress);
-        let mut late = false;
-        let mut report = |done: f32| {
-            progress.update(Phase::Fit, done);
-            late = clock.elapsed().as_secs_f64() > deadline;
-            !late && !progress.cancelled()
-        };
-        let training = Records {
-            dims: self.context.tracer.columns().learned(),
-            u: &records.u,
-            f: &records.f,
-            f_max: &records.f_max,
-            g: &records.g,
-            pixel: &records.pixel,
-            zeros: records.zeros,
-            ..Records::default()
-        };
-        let fit = learner.fit(&training, self.options.seed, &mut report);
-        self.seconds.fit = start.elapsed().as_secs_f64();
-        match fit {
-            Ok(fit) => {
-                self.training = serde_json::json!({
-                    "loss": fit.history,
-                    "seconds": fit.seconds,
-                    "dropped_nonfinite": fit.dropped_nonfinite,
-                    "outliers_removed": fit.outliers_removed,
-                    "trained_on": fit.trained_on,
-                    "samples": fit.samples,
-                    "guide": fit.guide.describe(),
-                });
-                Ok(Some(Arc::from(fit.guide)))
-            }
-            Err(GuideError::Cancelled) if late => {
-                self.notes
-                    .push("training did not end within the time; none is used".to_owned());
-                Ok(None)
-            }
-            Err(GuideError::Cancelled) => Err(RenderError::Cancelled),
-            Err(e @ GuideError::TooFewPaths { .. }) => {
-                self.notes.push(format!("{e}; none is used"));
-                Ok(None)
-            }
-            Err(e) => Err(e.into()),
-        }
-    }
-
-    fn check_dimensions(&self, guide: &dyn Guide) -> Result<(), RenderError> {
-        let expected = self.context.tracer.columns().learned();
-        let whole_path = guide.models().contains(&pss_guide::Decision::Path);
-        if whole_path && guide.dims() != expected {
-            return Err(RenderError::Dimensions {
-                name: guide.name().to_owned(),
-                found: guide.dims(),
-                expected,
-                k: self.options.k,
-                guide_k: guide.dims().saturating_sub(1) / 2,
-            });
+        if let Some(guide) = guide {
+            let name = self.current.name.clone();
+            self.drawn = Some((guide, name, mixture.uniform_fraction));
         }
         Ok(())
     }
 
-    /// The passes after the pilot.
-    fn paths(&mut self, guide: Option<&dyn Guide>) -> Result<(), RenderError> {
-        let start = Instant::now();
-        match self.options.budget.clone() {
-            Budget::Spp(spp) => {
-                let left = spp.saturating_sub(self.next_sample);
-                if left > 0 {
-                    self.pass(left, guide, (0.0, 1.0))?;
-                }
+    fn finish(mut self) -> Outcome {
+        let scene = self.context.tracer.scene();
+        match (
+            &self.drawn,
+            &self.current.guide,
+            self.current.refusal.take(),
+        ) {
+            (None, _, Some(refusal)) => self.notes.push(refusal),
+            // A guide that was learned just as the time ran out drew nothing, and is not what was rendered with.
+            (None, Some(unused), None) => {
+                let name = unused.name();
+                self.notes.push(format!(
+                    "{name}: the time was out after training; none is used"
+                ));
             }
-            Budget::Replay(passes) => {
-                let rest = passes.iter().filter(|p| p.kind != PassKind::Pilot);
-                let total: u32 = rest.clone().map(|p| p.spp).sum();
-                let mut done = 0;
-                for pass in rest {
-                    let share = |n: u32| n as f32 / total as f32;
-                    let guide = guide.filter(|_| pass.kind == PassKind::Guided);
-                    self.pass(pass.spp, guide, (share(done), share(done + pass.spp)))?;
-                    done += pass.spp;
-                }
-            }
-            Budget::Time(time) => self.timed_paths(time, guide)?,
+            _ => {}
         }
-        self.seconds.render = start.elapsed().as_secs_f64();
-        Ok(())
-    }
-
-    /// Passes that double, the last one cut to what the measured speed leaves time for. At least one
-    /// sample a pixel is rendered, however short the time.
-    fn timed_paths(&mut self, time: f64, guide: Option<&dyn Guide>) -> Result<(), RenderError> {
-        let start = Instant::now();
-        let (mut spp, mut rendered) = (1u32, 0u32);
-        let begin = self.clock.elapsed().as_secs_f64();
-        loop {
-            let now = self.clock.elapsed().as_secs_f64();
-            if rendered > 0 {
-                let each = start.elapsed().as_secs_f64() / f64::from(rendered);
-                let left = ((time - now) / each).clamp(0.0, f64::from(1 << 20)) as u32;
-                spp = (2 * spp)
-                    .min(left)
-                    .min(Options::MOST_SPP.saturating_sub(self.next_sample));
-                if spp == 0 {
-                    break;
-                }
-            } else if !self.passes.is_empty() && self.options.keep_pilot && now >= time {
-                break;
-            }
-            let share = |t: f64| ((t - begin) / (time - begin).max(1e-9)).clamp(0.0, 1.0) as f32;
-            let span = (
-                share(now),
-                share(now).max(0.99f32.min(share(now) * 2.0 + 0.01)),
-            );
-            self.pass(spp, guide, span)?;
-            rendered += spp;
-        }
-        Ok(())
-    }
-
-    fn pass(
-        &mut self,
-        spp: u32,
-        guide: Option<&dyn Guide>,
-        span: (f32, f32),
-    ) -> Result<(), RenderError> {
-        let mixture = Mixture {
-            uniform_fraction: self.options.uniform_fraction,
+        let [width, height] = scene.film().crop_size();
+        let film = match self.options.combine {
+            Combine::Samples => self.image.develop(),
+            Combine::Variance => by_variance(scene.film(), &self.apart),
         };
-        let pass = Pass {
-            phase: Phase::Render,
-            first_sample: self.next_sample,
-            spp,
-            guide: guide.map(|g| (g, mixture)),
-            record: 0.0,
-            span,
-        };
-        let result = self.context.render(&pass, &mut self.image)?;
-        self.rendered.add(&result.statistics);
-        self.next_sample += spp;
-        let kind = if guide.is_some() {
-            PassKind::Guided
-        } else {
-            PassKind::Uniform
-        };
-        self.passes.push(PassPlan {
-            kind,
-            spp,
-            record: 1.0,
-        });
-        Ok(())
-    }
-
-    fn finish(mut self, guide: Option<Arc<dyn Guide>>) -> Outcome {
-        // A guide that was learned just as the time ran out drew nothing, and is not what was rendered with.
-        let drawn = self.passes.iter().any(|p| p.kind == PassKind::Guided);
-        if let Some(unused) = guide.as_ref().filter(|_| !drawn) {
-            let name = unused.name();
-            self.notes.push(format!(
-                "{name}: the time was out after training; none is used"
-            ));
-        }
-        let guide = guide.filter(|_| drawn);
-        let [width, height] = self.context.tracer.scene().film().crop_size();
-        let film = self.image.develop();
         let mut all = self.pilot;
         all.add(&self.rendered);
         if all.counts.non_finite > 0 {
@@ -477,7 +283,7 @@ impl Run<'_> {
             ));
         }
         if all.counts.nonzero == 0 {
-            let why = if self.context.tracer.scene().emitters().is_empty() {
+            let why = if scene.emitters().is_empty() {
                 "the scene has no emitter"
             } else if all.counts.paths_found == 0 {
                 "no path found all its vertices"
@@ -486,21 +292,20 @@ impl Run<'_> {
             };
             self.notes.push(format!("the image is black: {why}"));
         }
+        let (guide, chosen, uniform_fraction) = match self.drawn {
+            Some((guide, name, a)) => (Some(guide), name, a),
+            None => (None, "none".to_owned(), 1.0),
+        };
         Outcome {
             width,
             height,
             film,
-            chosen: guide
-                .as_ref()
-                .map_or_else(|| "none".to_owned(), |g| g.name().to_owned()),
-            uniform_fraction: if guide.is_some() {
-                self.options.uniform_fraction
-            } else {
-                1.0
-            },
             guide,
+            chosen,
+            uniform_fraction,
+            candidates: self.current.candidates,
             notes: self.notes,
-            training: self.training,
+            training: self.current.training,
             passes: self.passes,
             pilot: self.pilot,
             rendered: self.rendered,

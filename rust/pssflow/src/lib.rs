@@ -7,22 +7,30 @@
 //! This crate joins the tracer (`pss-render`, which knows no guides) and the guides (`pss-guide`, which know
 //! no rays). It knows no Python.
 
+mod auto;
+mod choice;
+mod combine;
 mod error;
 mod estimator;
+mod learning;
 mod mixture;
 mod numbers;
 mod options;
 pub mod output;
 mod pass;
 mod progress;
+mod records;
+mod schedule;
 mod statistics;
 mod strategy;
 mod trace;
 
+pub use auto::{Auto, Named};
+pub use choice::{Chooser, Chosen, GuideChoice, Learner, Left};
 pub use error::RenderError;
 pub use estimator::{Outcome, Seconds, render};
 pub use mixture::Mixture;
-pub use options::{Budget, GuideChoice, Learner, Options, PassKind, PassPlan};
+pub use options::{Budget, Combine, Options, PassKind, PassPlan};
 pub use progress::{Phase, Progress, Silent};
 pub use statistics::{Counts, Statistics};
 pub use strategy::{AutoStrategy, auto_strategy};

@@ -2,7 +2,7 @@
 
 use pss_guide::{Context, Decision as GuideDecision, Guide};
 use pss_render::numbers::Lanes;
-use pss_render::{Decision, NumberSource};
+use pss_render::{Decision, NumberSource, VertexContext};
 
 use crate::mixture::Mixture;
 
@@ -11,7 +11,6 @@ pub(crate) struct GuidedNumbers<'a> {
     guide: &'a dyn Guide,
     /// Per path of the block: whether its coin chose the guide.
     guided: Vec<bool>,
-    looks_at_vertices: bool,
     scratch: Scratch,
 }
 
@@ -26,11 +25,9 @@ struct Scratch {
 
 impl<'a> GuidedNumbers<'a> {
     pub(crate) fn new(guide: &'a dyn Guide) -> Self {
-        let looks_at_vertices = guide.models().iter().any(|&d| d != GuideDecision::Path);
         Self {
             guide,
             guided: Vec::new(),
-            looks_at_vertices,
             scratch: Scratch::default(),
         }
     }
@@ -57,14 +54,7 @@ impl<'a> GuidedNumbers<'a> {
             s.u.extend_from_slice(&lanes.u[row..][lanes.columns.clone()]);
             // One an active path, or none at all where the guide looks at nothing.
             if let Some(c) = lanes.contexts.get(i) {
-                s.contexts.push(Context {
-                    position: c.position,
-                    normal: c.normal,
-                    outgoing: c.outgoing,
-                    pixel: c.pixel,
-                    emitter: c.emitter,
-                    bounce: c.bounce,
-                });
+                s.contexts.push(context(c));
             }
         }
         if s.lanes.is_empty() {
@@ -89,23 +79,40 @@ impl<'a> GuidedNumbers<'a> {
     }
 }
 
+/// A vertex as guides see it.
+pub(crate) fn context(c: &VertexContext) -> Context {
+    Context {
+        position: c.position,
+        normal: c.normal,
+        outgoing: c.outgoing,
+        pixel: c.pixel,
+        emitter: c.emitter,
+        bounce: c.bounce,
+    }
+}
+
+/// The guides' name of a decision; `None` for the one that is not learned, whose density stays 1.
+fn guides_name(decision: Decision) -> Option<GuideDecision> {
+    match decision {
+        Decision::Path => Some(GuideDecision::Path),
+        Decision::Direction(_) => Some(GuideDecision::Direction),
+        Decision::Emitter => Some(GuideDecision::Emitter),
+        Decision::Light => Some(GuideDecision::Light),
+        Decision::BsdfRay => None,
+    }
+}
+
 impl NumberSource for GuidedNumbers<'_> {
     fn decide(&mut self, decision: Decision, mut lanes: Lanes<'_>) {
-        let decision = match decision {
-            Decision::Path => GuideDecision::Path,
-            Decision::Direction(_) => GuideDecision::Direction,
-            Decision::Emitter => GuideDecision::Emitter,
-            Decision::Light => GuideDecision::Light,
-            // Not learned: its density stays 1.
-            Decision::BsdfRay => return,
-        };
-        if self.guide.models().contains(&decision) {
+        let modelled = |d: &GuideDecision| self.guide.models().contains(d);
+        if let Some(decision) = guides_name(decision).filter(modelled) {
             self.ask(decision, &mut lanes, true);
             self.ask(decision, &mut lanes, false);
         }
     }
 
-    fn looks_at_vertices(&self) -> bool {
-        self.looks_at_vertices
+    fn looks_at(&self, decision: Decision) -> bool {
+        guides_name(decision)
+            .is_some_and(|d| self.guide.models().contains(&d) && self.guide.looks_at_contexts(d))
     }
 }

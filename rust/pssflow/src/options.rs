@@ -1,45 +1,10 @@
 //! What can be asked of a render.
 
-use std::sync::Arc;
-
-use pss_guide::{Fit, Guide, GuideError, Records};
 use pss_render::{EmitterStrategy, Parametrisation};
 use serde::{Deserialize, Serialize};
 
+use crate::choice::GuideChoice;
 use crate::error::RenderError;
-
-/// Something that turns pilot paths into a guide.
-pub trait Learner: Send + Sync {
-    /// The guide's name.
-    fn name(&self) -> &str;
-
-    /// Seconds of training that each path costs, roughly; 0 where it does not depend on their number.
-    fn seconds_per_path(&self, _dims: usize) -> f64 {
-        0.0
-    }
-
-    /// Learns. `progress` gets the share that is done and answers whether to go on.
-    ///
-    /// # Errors
-    /// [`GuideError`]; the estimator passes it on, unless it means "too few paths", which ends in `none`.
-    fn fit(
-        &self,
-        records: &Records<'_>,
-        seed: u64,
-        progress: &mut dyn FnMut(f32) -> bool,
-    ) -> Result<Fit, GuideError>;
-}
-
-/// Where the numbers come from.
-#[derive(Clone)]
-pub enum GuideChoice {
-    /// Uniform numbers.
-    None,
-    /// A guide learned from the pilot.
-    Learn(Arc<dyn Learner>),
-    /// A guide learned before.
-    Ready(Arc<dyn Guide>),
-}
 
 /// How long to render.
 #[derive(Clone, Debug, PartialEq)]
@@ -64,17 +29,48 @@ pub enum PassKind {
     Uniform,
 }
 
+/// How passes become one image.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Combine {
+    /// Every sample counts the same: weights are fixed before sampling, and the image is unbiased.
+    #[default]
+    Samples,
+    /// Each pass's samples count with 1 ÷ their variance, one number for the whole image, estimated for each half of
+    /// a checkerboard of tiles from the other half. Its bias is of the order of 1 ÷ the samples of the passes.
+    Variance,
+}
+
+impl Combine {
+    /// The name used in options and records.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Samples => "samples",
+            Self::Variance => "variance",
+        }
+    }
+}
+
 /// One pass over the image; a list of these is the record from which a render is replayed.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PassPlan {
     /// What its paths are.
     pub kind: PassKind,
     /// Samples per pixel.
     pub spp: u32,
-    /// Share of a pilot's light-carrying paths that is kept for training; chosen before the pass.
+    /// Share of the light-carrying paths that is kept for training; chosen before the pass.
     #[serde(default = "all")]
     pub record: f32,
+    /// Guided: what drew it, by the name of its recipe.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub guide: Option<String>,
+    /// Guided: the mixture's share of uniform paths.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub a: Option<f32>,
+    /// Guided: whether the guide was fitted anew, to all paths kept so far, before this pass.
+    #[serde(default)]
+    pub fit: bool,
 }
 
 fn all() -> f32 {
@@ -94,12 +90,15 @@ pub struct Options {
     pub strategy: EmitterStrategy,
     /// How long to render.
     pub budget: Budget,
-    /// Share of uniform paths in the mixture, in [0, 1].
-    pub uniform_fraction: f32,
-    /// Samples per pixel of the pilot; `None`: a quarter of `Spp`, or a seventh of `Time`.
+    /// Share of uniform paths in the mixture, in [0, 1]; `None`: the guide's own, or what a chooser found best.
+    pub uniform_fraction: Option<f32>,
+    /// Samples per pixel of the pilot; `None`: an eighth of `Spp` or a tenth of `Time` for a guide that is refined from
+    /// pass to pass, a quarter or a seventh for one that is trained once.
     pub pilot_spp: Option<u32>,
     /// Whether the pilot enters the image.
     pub keep_pilot: bool,
+    /// How passes become one image.
+    pub combine: Combine,
     /// Seed of all random numbers.
     pub seed: u64,
     /// Threads; 0 is one a core.
@@ -107,9 +106,6 @@ pub struct Options {
     /// Paths that carry light kept for training, at most; more are thinned at random.
     pub max_records: usize,
 }
-
-/// The mixture's share of uniform paths where the user gives none: the robust value for flows and nets.
-pub(crate) const DEFAULT_UNIFORM_FRACTION: f32 = 0.25;
 
 impl Default for Options {
     fn default() -> Self {
@@ -119,9 +115,10 @@ impl Default for Options {
             parametrisation: Parametrisation::default(),
             strategy: EmitterStrategy::default(),
             budget: Budget::Spp(16),
-            uniform_fraction: DEFAULT_UNIFORM_FRACTION,
+            uniform_fraction: None,
             pilot_spp: None,
             keep_pilot: true,
+            combine: Combine::Samples,
             seed: 0,
             threads: 0,
             max_records: 2_000_000,
@@ -135,8 +132,7 @@ impl Options {
 
     pub(crate) fn check(&self) -> Result<(), RenderError> {
         let error = |name, value: String, rule| Err(RenderError::Option { name, value, rule });
-        let a = self.uniform_fraction;
-        if !(0.0..=1.0).contains(&a) {
+        if let Some(a) = self.uniform_fraction.filter(|a| !(0.0..=1.0).contains(a)) {
             return error("uniform_fraction", a.to_string(), "in [0, 1]");
         }
         match &self.budget {
@@ -150,7 +146,7 @@ impl Options {
             _ => {}
         }
         let pilot = self.pilot_spp.unwrap_or(1);
-        if matches!(self.guide, GuideChoice::Learn(_)) && !(1..=Self::MOST_SPP).contains(&pilot) {
+        if self.guide.learns() && !(1..=Self::MOST_SPP).contains(&pilot) {
             return error(
                 "pilot_spp",
                 pilot.to_string(),
@@ -190,6 +186,16 @@ impl Options {
                 "passes whose record lies in [0, 1]",
             );
         }
+        if let Some(a) = passes
+            .iter()
+            .filter_map(|p| p.a)
+            .find(|a| !(0.0..=1.0).contains(a))
+        {
+            return error(
+                format!("a pass with a = {a}"),
+                "passes whose a lies in [0, 1]",
+            );
+        }
         let guided = passes.iter().any(|p| p.kind == PassKind::Guided);
         if guided && matches!(self.guide, GuideChoice::None) {
             return error(
@@ -204,7 +210,12 @@ impl Options {
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
 mod tests {
+    use std::sync::Arc;
+
+    use pss_guide::{Fit, GuideError, Records};
+
     use super::*;
+    use crate::choice::Learner;
 
     struct Idle;
 
@@ -234,7 +245,14 @@ mod tests {
     }
 
     fn pass(kind: PassKind, spp: u32, record: f32) -> PassPlan {
-        PassPlan { kind, spp, record }
+        PassPlan {
+            kind,
+            spp,
+            record,
+            guide: None,
+            a: None,
+            fit: false,
+        }
     }
 
     #[test]

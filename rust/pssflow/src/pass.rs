@@ -4,7 +4,7 @@
 //! threads; their sums are merged in that order. So one seed gives one image, bit for bit.
 
 use pss_guide::Guide;
-use pss_render::math::{Rgb, luminance};
+use pss_render::math::Rgb;
 use pss_render::{Accumulator, Paths, Scene, Tile, Tracer, Uniform};
 use pss_rng::{Purpose, Stream, to_unit};
 use rayon::prelude::*;
@@ -13,6 +13,7 @@ use crate::error::RenderError;
 use crate::mixture::Mixture;
 use crate::numbers::GuidedNumbers;
 use crate::progress::{Phase, Progress};
+use crate::records::PathRecords;
 use crate::statistics::Statistics;
 
 /// Edge of a tile in pixels.
@@ -80,42 +81,16 @@ pub(crate) struct Pass<'a> {
     pub(crate) guide: Option<(&'a dyn Guide, Mixture)>,
     /// Share of the light-carrying paths to record, 0 for none.
     pub(crate) record: f32,
+    /// Whether their vertices are recorded, too.
+    pub(crate) contexts: bool,
     /// Share of the phase that is done before and after this pass, for the progress bar.
     pub(crate) span: (f32, f32),
-}
-
-/// Light-carrying paths of a pilot, and the number of those that carry none.
-#[derive(Clone, Debug, Default)]
-pub(crate) struct PilotRecords {
-    /// Learned numbers, 2k + 1 a path.
-    pub(crate) u: Vec<f32>,
-    /// Luminance of f.
-    pub(crate) f: Vec<f32>,
-    /// Largest RGB component of f.
-    pub(crate) f_max: Vec<f32>,
-    /// Density that each was drawn from.
-    pub(crate) g: Vec<f32>,
-    /// Film position, [0, 1)².
-    pub(crate) pixel: Vec<[f32; 2]>,
-    /// Paths without light.
-    pub(crate) zeros: u64,
-}
-
-impl PilotRecords {
-    pub(crate) fn append(&mut self, other: &mut Self) {
-        self.u.append(&mut other.u);
-        self.f.append(&mut other.f);
-        self.f_max.append(&mut other.f_max);
-        self.g.append(&mut other.g);
-        self.pixel.append(&mut other.pixel);
-        self.zeros += other.zeros;
-    }
 }
 
 /// What a pass adds up to.
 pub(crate) struct PassResult {
     pub(crate) statistics: Statistics,
-    pub(crate) records: PilotRecords,
+    pub(crate) records: PathRecords,
 }
 
 struct Piece {
@@ -133,7 +108,7 @@ impl PassContext<'_> {
         let pieces = self.pieces(pass);
         let mut total = PassResult {
             statistics: Statistics::default(),
-            records: PilotRecords::default(),
+            records: PathRecords::default(),
         };
         let (start, end) = pass.span;
         for (batch, work) in pieces.chunks(BATCH).enumerate() {
@@ -190,10 +165,11 @@ impl PassContext<'_> {
             sums: Accumulator::new(film, tile),
             result: PassResult {
                 statistics: Statistics::default(),
-                records: PilotRecords::default(),
+                records: PathRecords::default(),
             },
         };
         let mut paths = Paths::new(columns);
+        paths.record = pass.contexts && pass.record > 0.0;
         let mut guided = pass.guide.map(|(guide, _)| GuidedNumbers::new(guide));
         let mixture = pass.guide.map_or(
             Mixture {
@@ -290,13 +266,15 @@ impl PassContext<'_> {
             }
             piece.result.statistics.add_estimate(estimate, weight);
             if thin < pass.record {
-                let r = &mut piece.result.records;
-                r.u.extend_from_slice(&paths.u[i * columns.width()..][..columns.learned()]);
-                r.f.push(luminance(f));
-                r.f_max.push(f.max_element());
-                r.g.push(1.0);
                 let [x, y] = paths.film[i];
-                r.pixel.push([x / width, y / height]);
+                piece.result.records.push(
+                    paths,
+                    i,
+                    columns.width(),
+                    columns.learned(),
+                    (mixture, pass.record),
+                    [x / width, y / height],
+                );
             }
         }
     }

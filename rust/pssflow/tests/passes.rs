@@ -1,13 +1,17 @@
 //! Renders as lists of passes: what a plan says is what is rendered, and what goes wrong in one path stays there.
 #![allow(clippy::unwrap_used)]
 
-use std::path::{Path, PathBuf};
+mod common;
+
+use std::path::Path;
 use std::sync::Arc;
 
 use pss_guide::{Context, Decision, Guide, GuideError, Header};
 use pssflow::pss_render::Scene;
 use pssflow::{Budget, GuideChoice, Options, Outcome, PassKind, PassPlan, Silent, render};
-use serde_json::{Value, json};
+use serde_json::Value;
+
+use common::furnace;
 
 /// The density is `q`, whatever the numbers are: wrong unless q = 1, so that a test can see its weights.
 #[derive(Debug)]
@@ -57,44 +61,11 @@ impl Guide for Constant {
     }
 }
 
-/// The inside of an emitting sphere of albedo ½, radiance 1: two bounces carry ¼ everywhere.
-fn furnace() -> Scene {
-    let identity = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
-    let description = json!({
-        "schema": 1,
-        "textures": [
-            { "type": "constant", "id": "albedo", "value": [0.5, 0.5, 0.5] },
-            { "type": "constant", "id": "emitted", "value": [1.0, 1.0, 1.0] },
-        ],
-        "bsdfs": [{ "type": "diffuse", "id": "wall", "reflectance": 0 }],
-        "shapes": [{
-            "type": "sphere", "id": "furnace", "center": [0, 0, 0], "radius": 1.0, "flip_normals": true,
-            "to_world": identity, "bsdf": 0, "emitter": 0,
-        }],
-        "emitters": [{ "type": "area", "id": "light", "shape": 0, "radiance": 1 }],
-        "sensor": {
-            "type": "perspective", "to_world": identity, "x_fov": 60.0, "near_clip": 0.01, "far_clip": 1e4,
-            "principal_point_offset": [0.0, 0.0],
-        },
-        "film": {
-            "size": [1, 1], "crop_offset": [0, 0], "crop_size": [1, 1],
-            "rfilter": { "type": "box", "radius": 0.5, "table": [] },
-        },
-    });
-    // The Makefile sets PSSFLOW_EMBREE_DIRS; a plain `cargo test` finds the wheel in `.venv`.
-    let root = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../.venv/lib");
-    let python = std::fs::read_dir(root).into_iter().flatten().flatten();
-    let sites: Vec<PathBuf> = python.map(|p| p.path().join("site-packages")).collect();
-    embree4::add_search_dirs(&sites);
-    let device = embree4::Device::new().unwrap();
-    Scene::new(&description.to_string(), Vec::new(), &device).unwrap()
-}
-
 fn rendered(scene: &Scene, guide: GuideChoice, budget: Budget, a: f32) -> Outcome {
     let options = Options {
         guide,
         budget,
-        uniform_fraction: a,
+        uniform_fraction: Some(a),
         threads: 1,
         ..Options::default()
     };
@@ -106,16 +77,20 @@ fn constant(q: f32) -> GuideChoice {
 }
 
 fn pass(kind: PassKind, spp: u32) -> PassPlan {
+    let guided = kind == PassKind::Guided;
     PassPlan {
         kind,
         spp,
-        record: 1.0,
+        record: 0.0,
+        guide: guided.then(|| "constant".to_owned()),
+        a: guided.then_some(0.5),
+        fit: false,
     }
 }
 
 #[test]
 fn a_plan_is_rendered_pass_by_pass_as_it_says() {
-    let scene = furnace();
+    let scene = furnace(1);
     let plan = vec![
         pass(PassKind::Pilot, 100),
         pass(PassKind::Uniform, 100),
@@ -132,7 +107,7 @@ fn a_plan_is_rendered_pass_by_pass_as_it_says() {
 
 #[test]
 fn a_plan_without_a_guide_keeps_its_pilot() {
-    let scene = furnace();
+    let scene = furnace(1);
     let plan = vec![pass(PassKind::Pilot, 3), pass(PassKind::Uniform, 5)];
     let replayed = rendered(&scene, GuideChoice::None, Budget::Replay(plan), 0.5);
     let asked = rendered(&scene, GuideChoice::None, Budget::Spp(8), 0.5);
@@ -142,7 +117,7 @@ fn a_plan_without_a_guide_keeps_its_pilot() {
 
 #[test]
 fn a_path_that_is_not_finite_carries_no_light_in_any_count() {
-    let scene = furnace();
+    let scene = furnace(1);
     let outcome = rendered(&scene, constant(1e-45), Budget::Spp(64), 0.0);
     let counts = outcome.rendered.counts;
     assert_eq!(counts.non_finite, 64);

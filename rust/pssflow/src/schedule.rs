@@ -1,0 +1,188 @@
+//! Which passes a budget is cut into.
+
+use std::time::Instant;
+
+use crate::choice::{GuideChoice, Left};
+use crate::error::RenderError;
+use crate::estimator::Run;
+use crate::options::{Options, PassKind, PassPlan};
+
+/// Share of a time budget that the pilot may take, for a guide that is trained once and for one that is refined: later
+/// passes teach the latter, too.
+const PILOT_TIME: [f64; 2] = [1.0 / 7.0, 1.0 / 10.0];
+/// Under `--spp`, one sample in so many is the pilot's, likewise.
+const PILOT_DIVISOR: [u32; 2] = [4, 8];
+
+/// Share of a time budget that training is planned to take; what takes longer than the whole is given up.
+const TRAINING_TIME: f64 = 0.3;
+/// Samples per pixel that a timed pilot's memory for records is planned for.
+const TIMED_PILOT_SPP: u32 = 64;
+
+impl Run<'_> {
+    /// Passes that follow from the number of samples alone: a pilot, then, while there is something to learn, as many
+    /// samples as there are already, and all the rest where less than half as many again would be left.
+    pub(crate) fn by_samples(&mut self, total: u32) -> Result<(), RenderError> {
+        let refines = self.options.guide.refines();
+        if self.options.guide.learns() {
+            let usual = (total / PILOT_DIVISOR[usize::from(refines)]).max(1);
+            let spp = self.options.pilot_spp.unwrap_or(usual).min(total);
+            let record = self.record_share(spp, refines);
+            self.pass(PassKind::Pilot, spp, record, (0.0, 1.0))?;
+        }
+        let first = self.next_sample;
+        while self.next_sample < total {
+            let left = total - self.next_sample;
+            self.learn(self.left(f64::from(left), None))?;
+            let doubled = self.next_sample.max(1);
+            let last = self.current.settled || !refines || left < doubled + doubled.div_ceil(2);
+            let spp = if last { left } else { doubled };
+            let record = if last {
+                0.0
+            } else {
+                self.record_share(spp, true)
+            };
+            let share = |n: u32| (n - first) as f32 / (total - first) as f32;
+            let span = (share(self.next_sample), share(self.next_sample + spp));
+            self.pass(self.kind(), spp, record, span)?;
+        }
+        Ok(())
+    }
+
+    /// The passes of a record; before each guided one the guide is learned as it was then.
+    pub(crate) fn by_record(&mut self, passes: &[PassPlan]) -> Result<(), RenderError> {
+        let of = |pilot: bool| {
+            let same = passes
+                .iter()
+                .filter(move |p| (p.kind == PassKind::Pilot) == pilot);
+            same.map(|p| p.spp).sum::<u32>() as f32
+        };
+        let mut done = [0; 2];
+        for pass in passes {
+            let pilot = pass.kind == PassKind::Pilot;
+            if pass.kind == PassKind::Guided {
+                self.learn_again(pass)?;
+            }
+            let done = &mut done[usize::from(pilot)];
+            let span = (
+                *done as f32 / of(pilot),
+                (*done + pass.spp) as f32 / of(pilot),
+            );
+            *done += pass.spp;
+            self.pass(pass.kind, pass.spp, pass.record, span)?;
+        }
+        Ok(())
+    }
+
+    /// A pilot, then passes that double, the last one cut to what the measured speed leaves time for. At least one sample
+    /// a pixel is rendered, however short the time.
+    pub(crate) fn by_time(&mut self, time: f64) -> Result<(), RenderError> {
+        let mut uniform = None;
+        if self.options.guide.learns() {
+            self.timed_pilot(time)?;
+            uniform = Some(self.seconds.pilot / f64::from(self.next_sample));
+        }
+        let refines = self.options.guide.refines();
+        let begin = self.clock.elapsed().as_secs_f64();
+        let (mut spp, mut each): (u32, Option<f64>) = (1, None);
+        loop {
+            let now = self.clock.elapsed().as_secs_f64();
+            if now >= time && !self.passes.is_empty() && (self.options.keep_pilot || each.is_some())
+            {
+                break;
+            }
+            if let Some(uniform) = uniform {
+                self.learn(self.left((time - now).max(0.0) / uniform, Some(uniform)))?;
+            }
+            let now = self.clock.elapsed().as_secs_f64();
+            if now >= time && !self.passes.is_empty() && (self.options.keep_pilot || each.is_some())
+            {
+                break;
+            }
+            if let Some(each) = each {
+                let left = ((time - now) / each).clamp(0.0, f64::from(1 << 20)) as u32;
+                spp = (2 * spp)
+                    .min(left)
+                    .min(Options::MOST_SPP.saturating_sub(self.next_sample));
+                if spp == 0 {
+                    break;
+                }
+            }
+            let share = |t: f64| ((t - begin) / (time - begin).max(1e-9)).clamp(0.0, 1.0) as f32;
+            let span = (
+                share(now),
+                share(now).max(0.99f32.min(share(now) * 2.0 + 0.01)),
+            );
+            let record = if refines && !self.current.settled {
+                self.record_share(spp, true)
+            } else {
+                0.0
+            };
+            let start = Instant::now();
+            self.pass(self.kind(), spp, record, span)?;
+            each = Some(start.elapsed().as_secs_f64() / f64::from(spp));
+        }
+        Ok(())
+    }
+
+    /// One sample a pixel, then as many more as its measured speed allows (or as were asked for), of which no
+    /// more paths are kept than the guide can be trained on in its share of the time.
+    fn timed_pilot(&mut self, time: f64) -> Result<(), RenderError> {
+        let dims = self.context.tracer.columns().learned();
+        let seconds_per_path = match &self.options.guide {
+            GuideChoice::Learn(learner) => learner.seconds_per_path(dims),
+            _ => 0.0,
+        };
+        let refines = self.options.guide.refines();
+        let start = Instant::now();
+        let pixels = self.context.tracer.scene().film().pixels() as f64;
+        let affordable = time * TRAINING_TIME / seconds_per_path.max(f64::MIN_POSITIVE);
+        // How many paths carry light is not known yet; a quarter of all is on the high side.
+        let first = (4.0 * affordable / pixels).min(1.0) as f32;
+        let first = first.min(self.record_share(TIMED_PILOT_SPP, false));
+        self.pass(PassKind::Pilot, 1, first, (0.0, 0.1))?;
+        let each = start.elapsed().as_secs_f64();
+        let share = PILOT_TIME[usize::from(refines)];
+        let more = match self.options.pilot_spp {
+            Some(spp) => spp - 1,
+            None => ((time * share - each) / each).clamp(0.0, f64::from(1 << 20)) as u32,
+        };
+        if more == 0 {
+            return Ok(());
+        }
+        let nonzero = self.pilot.counts.nonzero as f64 * f64::from(more);
+        let left = (affordable - self.records.len() as f64).max(0.0);
+        let record = (left / nonzero.max(1.0)).min(1.0) as f32;
+        let record = record.min(self.record_share(more.max(TIMED_PILOT_SPP), refines));
+        self.pass(PassKind::Pilot, more, record, (0.1, 1.0))
+    }
+
+    /// Share of the light-carrying paths to keep so that a pass of `spp` fits the memory that is left for records, or
+    /// half of it if more passes are to teach, even if every path carries light. At random, since every other rule would
+    /// prefer a part of the image.
+    fn record_share(&self, spp: u32, more: bool) -> f32 {
+        let paths = self.context.tracer.scene().film().pixels() as f64 * f64::from(spp);
+        let room = self.options.max_records.saturating_sub(self.records.len()) as f64;
+        let room = if more { 0.5 * room } else { room };
+        (room / paths).min(1.0) as f32
+    }
+
+    fn kind(&self) -> PassKind {
+        match self.current.guide {
+            Some(_) => PassKind::Guided,
+            None => PassKind::Uniform,
+        }
+    }
+
+    /// What is left of the budget: samples per pixel, and the measured seconds of one on all threads.
+    fn left(&self, spp: f64, each: Option<f64>) -> Left {
+        let pixels = self.context.tracer.scene().film().pixels() as f64;
+        let threads = self.context.pool.current_num_threads();
+        Left {
+            paths: spp * pixels,
+            seconds_per_path: each.map(|each| each * threads as f64 / pixels),
+            threads,
+            found: self.pilot.counts.paths_found as f64
+                / (self.pilot.counts.camera_rays as f64).max(1.0),
+        }
+    }
+}
