@@ -407,7 +407,7 @@ fn split(records: &Records<'_>) -> (Part, Part) {
     for (i, row) in (0..rows).step_by(stride).enumerate() {
         // Scrambled, since the samples of a pixel lie next to each other.
         let scrambled = (i as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 32;
-        if scrambled % HOLD_OUT == 0 {
+        if scrambled.is_multiple_of(HOLD_OUT) {
             held.push(records, row);
         } else {
             fitted_to.push(records, row);

@@ -234,7 +234,6 @@ fn learning_while_rendering_is_unbiased() {
     );
 
     let (mean, se) = mean_of_many(8, 4096, 8, Combine::Samples);
-    println!("mean {mean:.6} ± {se:.6} of the truth");
     assert!(se < 0.005, "{se}");
     assert!((mean - 1.0).abs() < 4.0 * se, "{mean} ± {se}");
 }
@@ -242,7 +241,6 @@ fn learning_while_rendering_is_unbiased() {
 #[test]
 fn weights_by_variance_have_little_bias() {
     let (mean, se) = mean_of_many(16, 512, 8, Combine::Variance);
-    println!("mean {mean:.6} ± {se:.6} of the truth");
     assert!(se < 0.005, "{se}");
     assert!((mean - 1.0).abs() < 0.002 + 4.0 * se, "{mean} ± {se}");
 }

@@ -6,4 +6,5 @@ mod density;
 mod files;
 mod input;
 mod places;
+mod select;
 mod world;

@@ -71,7 +71,7 @@ impl World {
     /// A vertex from four numbers: on one of six sheets, one a normal.
     pub(crate) fn context(&self, bounce: usize, numbers: [f32; 4]) -> Context {
         let side = ((numbers[0] * 6.0) as usize).min(5);
-        let sign = if side % 2 == 0 { 1.0 } else { -1.0 };
+        let sign = if side.is_multiple_of(2) { 1.0 } else { -1.0 };
         let mut normal = [0.1, -0.1, 0.05];
         normal[side / 2] = sign * 0.98;
         let at = [numbers[1], numbers[2], side as f32 / 5.0];
