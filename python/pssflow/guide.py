@@ -270,7 +270,7 @@ def guide_names() -> list[str]:
 
 def usual_guide(preset: str | None) -> str:
     """The guide where none is given."""
-    return DEFAULT_GUIDE if preset not in PRESETS else PRESETS[preset].guide
+    return PRESETS[preset].guide if preset is not None and preset in PRESETS else DEFAULT_GUIDE
 
 
 def choose(guide: Any, options: Mapping[str, Any]) -> Choice:
