@@ -31,8 +31,12 @@ class Guide:
         f: F32,
         *,
         f_max: F32 | None = None,
+        f_bsdf: F32 | None = None,
         g: F32 | None = None,
         zeros: int = 0,
+        contexts: dict[str, NDArray[Any]] | None = None,
+        pixel: F32 | None = None,
+        emitters: list[tuple[float, bool]] = ...,
         options: str = "{}",
         seed: int = 0,
         progress: Callable[[str, float], None] | None = None,
@@ -43,10 +47,20 @@ class Guide:
         path: str, columns_hash: str | None = None, scene_hash: str | None = None
     ) -> Guide: ...
     def save(self, path: str, columns_hash: str, scene_hash: str) -> None: ...
-    def sample(self, n: int, seed: int = 0) -> tuple[F32, F32]:
+    def sample(
+        self,
+        n: int,
+        seed: int = 0,
+        decision: str = "path",
+        contexts: dict[str, NDArray[Any]] | None = None,
+    ) -> tuple[F32, F32]:
         """Draws (n, d) numbers and their log-density (n,); -inf is never returned for a drawn row."""
-    def log_prob(self, u: F32) -> F32:
+    def log_prob(
+        self, u: F32, decision: str = "path", contexts: dict[str, NDArray[Any]] | None = None
+    ) -> F32:
         """Log-density of rows u (n, d), shape (n,)."""
+    @property
+    def models(self) -> list[str]: ...
     @property
     def name(self) -> str: ...
     @property
@@ -80,6 +94,8 @@ class Scene:
     def summary(self) -> str:
         """JSON: counts of shapes, BSDFs, emitters; triangles, degenerate_triangles, geometry_bytes."""
     def columns(self, k: int, emitter_strategy: str) -> list[str]: ...
+    def emitter_intervals(self) -> list[tuple[float, bool]]:
+        """Per emitter: the upper end of its interval of the emitter's number, and whether it surrounds the scene."""
     def columns_hash(self, k: int, parametrisation: str) -> str: ...
     def auto_strategy(
         self, *, k: int, parametrisation: str, threads: int = 0

@@ -113,8 +113,11 @@ class Guide:
         u: ArrayLike,
         f: ArrayLike,
         *,
+        f_bsdf: ArrayLike | None = None,
         g: ArrayLike | None = None,
         zeros: int = 0,
+        contexts: Mapping[str, ArrayLike] | None = None,
+        emitters: ArrayLike | None = None,
         seed: int = 0,
         columns_hash: str = "",
         scene_hash: str = "",
@@ -129,11 +132,18 @@ class Guide:
         | `f`  | (n,) or (n, 3) | ≥ 0         | what they contributed; rows of zero are counted, not learned |
         | `g`  | (n,)           | > 0         | density that they were drawn from; None for 1                |
 
+        `Pilot.fit` gives all of this. Guides that look at where paths are need `contexts`: `position`, `normal`,
+        `outgoing` (n, k, 3) of x₁ … x_k, `pixel` (n, 2) in [0, 1)², and `emitter` (n,), the one chosen at x_k.
+
         Args:
-            name: a name of `registry()`.
+            name: a name of `registry()`, several joined by `+`, or one of `aliases()`.
             u: see above.
             f: see above; of RGB values the luminance, and for resampling the largest component, is learned.
+            f_bsdf: the part of f that the emitter's and the light's numbers do not decide, shaped as f; None for 0.
             g: see above.
+            contexts: see above.
+            emitters: per emitter the upper end of its interval of the emitter's number and whether it surrounds the
+                scene (m, 2); None for a single one.
             zeros: paths without light that were left out of `u`.
             seed: of the initial weights and the order of training.
             columns_hash: stored by `save`; see `Pilot`.
@@ -148,21 +158,31 @@ class Guide:
         rgb = np.asarray(f, np.float32)
         if rgb.shape not in ((len(u),), (len(u), 3)):
             raise ValueError(f"`f` has shape {rgb.shape}; expected ({len(u)},) or ({len(u)}, 3)")
-        luminance = rgb @ LUMINANCE if rgb.ndim == 2 else rgb
+        luminance = _luminance(rgb)
         largest = rgb.max(axis=1) if rgb.ndim == 2 else rgb
         # NaN is no zero: it goes on to the core, which counts and drops it.
         lit = ~(largest == 0.0)
         density = np.ones(len(u), np.float32) if g is None else np.asarray(g, np.float32)
         if density.shape != (len(u),):
             raise ValueError(f"`g` has shape {density.shape}; expected ({len(u)},)")
+        term = None if f_bsdf is None else _luminance(np.asarray(f_bsdf, np.float32))
+        if term is not None and term.shape != (len(u),):
+            raise ValueError(f"`f_bsdf` has shape {term.shape}; expected that of `f`")
+        pixel = None if contexts is None else contexts.get("pixel")
         core = _core.Guide.fit(
             name,
             np.ascontiguousarray(u[lit]),
             np.ascontiguousarray(luminance[lit]),
             f_max=np.ascontiguousarray(largest[lit]),
+            f_bsdf=None if term is None else np.ascontiguousarray(term[lit]),
             g=np.ascontiguousarray(density[lit]),
+            contexts=None if contexts is None else _vertices(contexts, lit),
+            pixel=None if pixel is None else _rows(np.asarray(pixel)[lit]),
+            emitters=[]
+            if emitters is None
+            else [(float(e), bool(s)) for e, s in np.asarray(emitters)],
             zeros=check_integer("zeros", zeros, 0, 2**63) + int(np.count_nonzero(~lit)),
-            options=options_json(options),
+            options=options_json(_by_part(name, options)),
             seed=check_integer("seed", seed, 0, MAX_SEED),
             progress=progress,
         )
@@ -193,22 +213,51 @@ class Guide:
         """
         self.core.save(os.fspath(path), self.columns_hash, self.scene_hash)
 
-    def sample(self, n: int, seed: int = 0) -> tuple[F32, F32]:
-        """Draws numbers (n, d) and their log-density (n,). Some guides put rows outside [0, 1): see `mass_outside`."""
-        return self.core.sample(
-            check_integer("n", n, 0, 2**40), check_integer("seed", seed, 0, MAX_SEED)
-        )
+    def sample(
+        self,
+        n: int,
+        seed: int = 0,
+        *,
+        decision: str = "path",
+        contexts: Mapping[str, ArrayLike] | None = None,
+    ) -> tuple[F32, F32]:
+        """Draws numbers (n, d) and their log-density (n,). Some guides put rows outside [0, 1): see `mass_outside`.
 
-    def log_prob(self, u: ArrayLike) -> F32:
-        """Log-density (n,) of numbers (n, d).
+        Args:
+            n: rows.
+            seed: the same seed gives the same rows.
+            decision: one of `models`: `path` (all numbers at once), `direction` (d = 2), `emitter` (1) or `light` (2).
+            contexts: where it is taken, a row each, for guides that look: `position`, `normal`, `outgoing` (n, 3),
+                `pixel` (n, 2), `emitter`, `bounce` (n,); what is missing is zero, and bounce 1.
 
         Raises:
-            ValueError: `u` has another number of columns.
+            ValueError: the guide does not model the decision, or looks at contexts and has none.
+        """
+        rows = check_integer("n", n, 0, 2**40)
+        seed = check_integer("seed", seed, 0, MAX_SEED)
+        return self.core.sample(rows, seed, decision, _places(contexts))
+
+    def log_prob(
+        self,
+        u: ArrayLike,
+        *,
+        decision: str = "path",
+        contexts: Mapping[str, ArrayLike] | None = None,
+    ) -> F32:
+        """Log-density (n,) of a decision's numbers (n, d); `decision` and `contexts` as in `sample`.
+
+        Raises:
+            ValueError: `u` has another number of columns, or as `sample`.
         """
         u = _rows(u)
-        if u.shape[1] != self.dims:
+        if decision == "path" and "path" in self.models and u.shape[1] != self.dims:
             raise ValueError(f"`u` has {u.shape[1]} columns; this guide has {self.dims}")
-        return self.core.log_prob(u)
+        return self.core.log_prob(u, decision, _places(contexts))
+
+    @property
+    def models(self) -> list[str]:
+        """The decisions that it models."""
+        return self.core.models
 
     @property
     def name(self) -> str:
@@ -347,6 +396,15 @@ def _named(guide: str, options: Mapping[str, Any]) -> Choice:
                 f"`guide` = {guide!r} is unknown (known: {_known()}; or the path of a saved guide)"
             )
     options_json(options)
+    return Choice(guide, guide, learns=True, options=_by_part(guide, options))
+
+
+def _by_part(guide: str, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Options of a guide as the core takes them: those of a composite by the names of its parts."""
+    known = registry()
+    parts = aliases().get(guide, guide).split("+")
+    if any(part not in known for part in parts):
+        return dict(options)  # the core refuses the name, and lists what there is
     by_part: dict[str, dict[str, Any]] = {part: {} for part in parts}
     for key, value in options.items():
         if key in by_part and isinstance(value, Mapping):
@@ -362,7 +420,41 @@ def _named(guide: str, options: Mapping[str, Any]) -> Choice:
             raise ValueError(f"`{option}` is no option of {' or '.join(parts)}")
         for part in owners:
             by_part[part][option] = value
-    return Choice(guide, guide, learns=True, options=by_part[guide] if len(parts) == 1 else by_part)
+    return by_part[parts[0]] if len(parts) == 1 else by_part
+
+
+def _luminance(values: F32) -> F32:
+    return values @ LUMINANCE if values.ndim == 2 else values
+
+
+def _vertices(contexts: Mapping[str, ArrayLike], rows: NDArray[np.bool_]) -> dict[str, Any]:
+    """Contexts of whole paths, (n, k, …), as one row a vertex; the emitter belongs to the last one."""
+    position = np.asarray(contexts["position"], np.float32)[rows]
+    n, k = position.shape[:2]
+    flat: dict[str, Any] = {
+        name: np.asarray(contexts[name], np.float32)[rows].reshape(n * k, 3)
+        for name in ("position", "normal", "outgoing")
+        if name in contexts
+    }
+    flat["bounce"] = np.tile(np.arange(1, k + 1, dtype=np.uint32), n)
+    if "pixel" in contexts:
+        flat["pixel"] = np.repeat(np.asarray(contexts["pixel"], np.float32)[rows], k, axis=0)
+    if "emitter" in contexts:
+        emitter = np.zeros((n, k), np.uint32)
+        emitter[:, -1] = np.asarray(contexts["emitter"])[rows]
+        flat["emitter"] = emitter.ravel()
+    return flat
+
+
+def _places(contexts: Mapping[str, ArrayLike] | None) -> dict[str, Any] | None:
+    """Contexts of decisions, a row each, in the core's types."""
+    if contexts is None:
+        return None
+    whole = ("emitter", "bounce")
+    return {
+        name: np.ascontiguousarray(value, np.uint32 if name in whole else np.float32)
+        for name, value in contexts.items()
+    }
 
 
 def _known() -> str:

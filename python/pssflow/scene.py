@@ -81,6 +81,8 @@ class Pilot(Trace):
     """Film positions in pixels from the crop's corner, (n, 2); with a lens (n, 4), its two numbers behind them."""
     g: F32
     """Density that the numbers were drawn from, (n,); 1 throughout."""
+    emitters: F32
+    """Per emitter: the upper end of its interval of the emitter's number, and 1 if it surrounds the scene, (m, 2)."""
     columns: list[str] = field(default_factory=list)
     """What each column of `u` decides."""
     learned: int = 0
@@ -136,7 +138,13 @@ class Pilot(Trace):
             name,
             self.u[:, : self.learned],
             self.f,
+            f_bsdf=self.f_bsdf,
             g=self.g,
+            contexts={
+                name: getattr(self, name)
+                for name in ("position", "normal", "outgoing", "pixel", "emitter")
+            },
+            emitters=self.emitters,
             seed=seed,
             columns_hash=self.columns_hash,
             scene_hash=self.scene_hash,
@@ -291,8 +299,10 @@ class Scene:
             threads=check_threads(threads),
         )
         arrays = {item.name: values[item.name] for item in fields(Pilot) if item.name in values}
+        intervals = np.array(self.core.emitter_intervals(), np.float32).reshape(-1, 2)
         return Pilot(
             **arrays,
+            emitters=intervals,
             columns=self.core.columns(k, strategy),
             learned=2 * k + 1,
             columns_hash=self.core.columns_hash(k, parametrisation),

@@ -149,6 +149,54 @@ def test_defaults(furnace):
     assert sum(candidate["chosen"] for candidate in stats["candidates"]) == 1
 
 
+def test_tables_are_fitted_and_asked_in_python(furnace):
+    """The density of a cell's numbers integrates to one, and samples are distributed as it says."""
+    pilot = furnace.pilot(spp=64, k=2)
+    guide = pilot.fit("table")
+    assert guide.models == ["direction", "emitter", "light"]
+    n = 20_000
+    row = int(np.flatnonzero(pilot.f.any(axis=1))[0])
+    place = {
+        name: np.tile(getattr(pilot, name)[row, 0], (n, 1))
+        for name in ("position", "normal", "outgoing")
+    }
+    uniform = np.random.default_rng(3).random((n, 2), dtype=np.float32)
+    q = np.exp(guide.log_prob(uniform, decision="direction", contexts=place))
+    assert abs(q.mean() - 1) < 5 * q.std() / np.sqrt(n) + 1e-6
+    u, log_q = guide.sample(n, 4, decision="direction", contexts=place)
+    np.testing.assert_allclose(
+        guide.log_prob(u, decision="direction", contexts=place), log_q, atol=1e-4
+    )
+    # E_q[1/q] is the cube's volume where q > 0, which here is everywhere.
+    weights = np.exp(-log_q)
+    assert abs(weights.mean() - 1) < 5 * weights.std() / np.sqrt(n) + 1e-6
+
+
+def test_a_guide_that_looks_says_what_it_misses(furnace):
+    pilot = furnace.pilot(spp=4, k=2)
+    guide = pilot.fit("direction-table")
+    for call, message in (
+        (lambda: guide.sample(3), 'has no decision "path"'),
+        (lambda: guide.sample(3, decision="light"), 'has no decision "light"'),
+        (lambda: guide.sample(3, decision="direction"), "give `contexts`"),
+        (lambda: guide.sample(3, decision="where"), 'decision "where" is unknown'),
+        (
+            lambda: guide.sample(3, decision="direction", contexts={"place": [[0, 0, 0]] * 3}),
+            r'contexts\["place"\] is unknown',
+        ),
+        (
+            lambda: guide.sample(3, decision="direction", contexts={"position": [[0, 0, 0]]}),
+            "position has 1 rows, expected 3",
+        ),
+        (
+            lambda: pssflow.Guide.fit("table", pilot.u[:, :5], pilot.f),
+            "give `contexts`",
+        ),
+    ):
+        with pytest.raises(ValueError, match=message):
+            call()
+
+
 def test_a_preset_has_a_guide_of_its_own(furnace):
     stats = furnace.render(spp=4, preset="thesis", progress=False).stats
     assert (stats["guide"], stats["a"]) == ("realnvp", 0.0)
@@ -417,9 +465,12 @@ def test_rows_of_zero_are_counted(furnace, monkeypatch):
         seen.update(options, u=args[1], f=args[2])
         return "core"
 
-    monkeypatch.setattr(
-        guides, "_core", type("Core", (), {"Guide": type("G", (), {"fit": staticmethod(fit)})})
-    )
+    core = {
+        "Guide": type("G", (), {"fit": staticmethod(fit)}),
+        "guides": staticmethod(lambda: "[]"),
+        "guide_aliases": staticmethod(lambda: "{}"),
+    }
+    monkeypatch.setattr(guides, "_core", type("Core", (), core))
     f = np.array([[0, 0, 0], [1, 2, 3], [np.nan, 0, 0]], np.float32)
     pssflow.Guide.fit("any", np.zeros((3, 2)), f, zeros=4, alpha=1)
     assert len(seen["u"]) == 2

@@ -4,14 +4,15 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use numpy::{PyReadonlyArray1, PyReadonlyArray2};
-use pss_guide::{Decision, Header, Records};
+use pss_guide::{Context, Decision, Header, Recipe, Records};
 use pss_rng::{Purpose, Stream};
 use pyo3::exceptions::PyMemoryError;
 use pyo3::prelude::*;
+use pyo3::types::PyDict;
 use serde_json::{Map, Value};
 
 use crate::watch::watched;
-use crate::{arrays, errors};
+use crate::{arrays, contexts, errors};
 
 /// A fitted density on the cube of primary numbers.
 #[pyclass(module = "pssflow._core", frozen)]
@@ -25,9 +26,12 @@ const CHUNK: usize = 1 << 14;
 
 #[pymethods]
 impl Guide {
-    /// Fits guide `name` to numbers and contributions.
+    /// Fits guide `name` to numbers and contributions, and for a guide that looks at vertices to these.
     #[staticmethod]
-    #[pyo3(signature = (name, u, f, *, f_max=None, g=None, zeros=0, options="{}", seed=0, progress=None))]
+    #[pyo3(signature = (
+        name, u, f, *, f_max=None, f_bsdf=None, g=None, zeros=0, contexts=None, pixel=None, emitters=Vec::new(),
+        options="{}", seed=0, progress=None
+    ))]
     #[allow(clippy::too_many_arguments)]
     fn fit(
         py: Python<'_>,
@@ -35,29 +39,51 @@ impl Guide {
         u: PyReadonlyArray2<'_, f32>,
         f: PyReadonlyArray1<'_, f32>,
         f_max: Option<PyReadonlyArray1<'_, f32>>,
+        f_bsdf: Option<PyReadonlyArray1<'_, f32>>,
         g: Option<PyReadonlyArray1<'_, f32>>,
         zeros: u64,
+        contexts: Option<Bound<'_, PyDict>>,
+        pixel: Option<PyReadonlyArray2<'_, f32>>,
+        emitters: Vec<(f32, bool)>,
         options: &str,
         seed: u64,
         progress: Option<Py<PyAny>>,
     ) -> PyResult<Self> {
         let options = parse_options(options)?;
+        let recipe = Recipe::parse(name, &options).map_err(errors::guide)?;
         let (u, dims) = arrays::matrix(&u);
         let f = arrays::vector(&f);
         let f_max = f_max.map_or_else(|| f.clone(), |a| arrays::vector(&a));
+        let f_bsdf = f_bsdf.map_or_else(Vec::new, |a| arrays::vector(&a));
         let g = g.map_or_else(|| vec![1.0; f.len()], |a| arrays::vector(&a));
+        let pixel = pixel.map_or(Ok(Vec::new()), |a| arrays::rows::<2>(&a, "pixel"))?;
+        let vertices = f.len() * (dims.saturating_sub(1) / 2);
+        let contexts = match contexts {
+            Some(dict) => contexts::contexts(&dict, vertices)?,
+            None if recipe.looks_at_contexts() => {
+                return Err(errors::value(format!(
+                    "guide {name:?} looks at where paths are: give `contexts`, as `Pilot.fit` does"
+                )));
+            }
+            None => Vec::new(),
+        };
+        let emitters = contexts::emitters(emitters);
         let fit = watched(py, progress.as_ref(), |shared| {
             let records = Records {
                 dims,
                 u: &u,
                 f: &f,
+                f_bsdf: &f_bsdf,
                 f_max: &f_max,
                 g: &g,
+                contexts: &contexts,
+                pixel: &pixel,
+                emitters: &emitters,
                 zeros,
                 ..Records::default()
             };
             use pssflow::Progress;
-            pss_guide::fit(name, &options, &records, seed, &mut |done| {
+            recipe.fit(&records, seed, &mut |done| {
                 shared.update(pssflow::Phase::Fit, done);
                 !shared.cancelled()
             })
@@ -104,56 +130,86 @@ impl Guide {
             .map_err(errors::guide)
     }
 
-    /// Draws rows of numbers, and their log-density.
-    #[pyo3(signature = (n, seed=0))]
-    fn sample(&self, py: Python<'_>, n: usize, seed: u64) -> PyResult<(Py<PyAny>, Py<PyAny>)> {
-        let dims = self.inner.dims();
+    /// Draws rows of numbers of a decision, and their log-density.
+    #[pyo3(signature = (n, seed=0, decision="path", contexts=None))]
+    fn sample(
+        &self,
+        py: Python<'_>,
+        n: usize,
+        seed: u64,
+        decision: &str,
+        contexts: Option<Bound<'_, PyDict>>,
+    ) -> PyResult<(Py<PyAny>, Py<PyAny>)> {
+        let (decision, width) = self.asked(decision)?;
+        let contexts = self.contexts(decision, contexts.as_ref(), n)?;
         let stream = Stream::new(seed, Purpose::Guide);
         let too_many =
             |_| PyMemoryError::new_err(format!("n = {n}: so many rows do not fit in memory"));
         let (mut u, mut log_q) = (Vec::new(), Vec::new());
-        u.try_reserve_exact(n.saturating_mul(dims))
+        u.try_reserve_exact(n.saturating_mul(width))
             .map_err(too_many)?;
         log_q.try_reserve_exact(n).map_err(too_many)?;
         for start in (0..n).step_by(CHUNK) {
             py.check_signals()?;
             let rows = (n - start).min(CHUNK);
+            let here = contexts.get(start..start + rows).unwrap_or_default();
             let (chunk, q) = py.detach(|| {
-                let mut chunk = Vec::with_capacity(rows * dims);
+                let mut chunk = Vec::with_capacity(rows * width);
                 for row in start..start + rows {
                     let mut numbers = stream.sequence(row as u32, (row as u64 >> 32) as u32);
-                    chunk.extend((0..dims).map(|_| numbers.next_f32()));
+                    chunk.extend((0..width).map(|_| numbers.next_f32()));
                 }
                 let mut q = vec![0.0; rows];
-                self.inner.sample(Decision::Path, &[], &mut chunk, &mut q);
+                self.inner.sample(decision, here, &mut chunk, &mut q);
                 (chunk, q)
             });
             u.extend(chunk);
             log_q.extend(q.into_iter().map(f32::ln));
         }
         Ok((
-            arrays::to_matrix(py, u, dims)?,
+            arrays::to_matrix(py, u, width)?,
             arrays::to_vector(py, log_q),
         ))
     }
 
-    /// Log-density of rows.
-    fn log_prob(&self, py: Python<'_>, u: PyReadonlyArray2<'_, f32>) -> PyResult<Py<PyAny>> {
+    /// Log-density of rows of a decision's numbers.
+    #[pyo3(signature = (u, decision="path", contexts=None))]
+    fn log_prob(
+        &self,
+        py: Python<'_>,
+        u: PyReadonlyArray2<'_, f32>,
+        decision: &str,
+        contexts: Option<Bound<'_, PyDict>>,
+    ) -> PyResult<Py<PyAny>> {
+        let (decision, expected) = self.asked(decision)?;
         let (u, width) = arrays::matrix(&u);
-        let dims = self.inner.dims();
-        if width != dims {
+        if width != expected {
             return Err(errors::value(format!(
-                "u has {width} columns, but this guide has {dims}"
+                "u has {width} columns, but this decision has {expected}"
             )));
         }
-        let mut log_q = Vec::with_capacity(u.len() / dims);
-        for chunk in u.chunks(CHUNK * dims) {
+        let rows = u.len() / width;
+        let contexts = self.contexts(decision, contexts.as_ref(), rows)?;
+        let mut log_q = Vec::with_capacity(rows);
+        for (i, chunk) in u.chunks(CHUNK * width).enumerate() {
             py.check_signals()?;
-            let mut q = vec![0.0; chunk.len() / dims];
-            py.detach(|| self.inner.density(Decision::Path, &[], chunk, &mut q));
+            let mut q = vec![0.0; chunk.len() / width];
+            let here = contexts
+                .get(i * CHUNK..i * CHUNK + q.len())
+                .unwrap_or_default();
+            py.detach(|| self.inner.density(decision, here, chunk, &mut q));
             log_q.extend(q.into_iter().map(f32::ln));
         }
         Ok(arrays::to_vector(py, log_q))
+    }
+
+    /// The decisions that it models.
+    #[getter]
+    fn models(&self) -> Vec<String> {
+        let names = self.inner.models().iter();
+        names
+            .filter_map(|d| serde_json::to_value(d).ok()?.as_str().map(str::to_owned))
+            .collect()
     }
 
     /// Name in the registry.
@@ -187,6 +243,37 @@ impl Guide {
 
     fn __repr__(&self) -> String {
         format!("Guide({:?}, dims={})", self.inner.name(), self.inner.dims())
+    }
+}
+
+impl Guide {
+    /// A decision by its name, and how many numbers it takes.
+    fn asked(&self, name: &str) -> PyResult<(Decision, usize)> {
+        let decision = contexts::decision(name)?;
+        if self.inner.models().contains(&decision) {
+            return Ok((decision, contexts::width(decision, self.inner.dims())));
+        }
+        Err(errors::value(format!(
+            "guide {:?} has no decision {name:?} (it has: {}); name one with `decision`",
+            self.inner.name(),
+            self.models().join(", ")
+        )))
+    }
+
+    fn contexts(
+        &self,
+        decision: Decision,
+        given: Option<&Bound<'_, PyDict>>,
+        rows: usize,
+    ) -> PyResult<Vec<Context>> {
+        match given {
+            Some(dict) => contexts::contexts(dict, rows),
+            None if self.inner.looks_at_contexts(decision) => Err(errors::value(format!(
+                "guide {:?} looks at where the decision is taken: give `contexts`, a row for each",
+                self.inner.name()
+            ))),
+            None => Ok(Vec::new()),
+        }
     }
 }
 

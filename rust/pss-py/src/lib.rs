@@ -3,6 +3,7 @@
 //! Types and documentation for Python are in `python/pssflow/_core.pyi`.
 
 mod arrays;
+mod contexts;
 mod errors;
 mod foreign;
 mod guide;

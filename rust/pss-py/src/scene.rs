@@ -140,6 +140,11 @@ impl Scene {
         Ok(Columns::new(k, strategy).names())
     }
 
+    /// Per emitter: the upper end of its interval of the emitter's number, and whether it surrounds the scene.
+    fn emitter_intervals(&self) -> Vec<(f32, bool)> {
+        self.inner.emitter_intervals().collect()
+    }
+
     /// Hash of the learned columns' meaning.
     fn columns_hash(&self, k: usize, parametrisation: &str) -> PyResult<String> {
         let name = self::parametrisation(parametrisation)?.name();
