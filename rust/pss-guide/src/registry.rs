@@ -33,8 +33,9 @@ pub struct GuideSpec {
     pub seconds_per_path: fn(&Map<String, Value>, usize) -> f64,
     /// The defensive mixture's share of uniform paths that suits it when nothing is known of the scene.
     pub uniform_fraction: f32,
-    /// What it adds to the cost of a path, in paths of 1.5 µs (a two-bounce path on one core); measured by
-    /// `examples/guide_cost.rs`. selection uses it where no time is measured.
+    /// What it adds to the cost of a path, in uniform paths: time of a guided pass ÷ time of a uniform one, less one. Most
+    /// of it is no arithmetic of the guide: guided paths survive longer and send more rays. Selection uses it, and more
+    /// where it measures more.
     pub cost_ratio: f64,
     /// Whether a fit is so cheap (well under a microsecond a path) that a render may repeat it as its paths double.
     pub refine: bool,
@@ -83,7 +84,7 @@ static REGISTRY: [GuideSpec; 5] = [
         validate: |o| Kind::Direction.validate(o),
         seconds_per_path: |_, _| 0.0,
         uniform_fraction: 0.1,
-        cost_ratio: 0.03,
+        cost_ratio: 0.5,
         refine: true,
         fit: |o, r, _, p| TableGuide::fit(Kind::Direction, o, r, p),
         restore: |c| TableGuide::restore(Kind::Direction, c),
@@ -96,7 +97,7 @@ static REGISTRY: [GuideSpec; 5] = [
         validate: |o| Kind::Emitter.validate(o),
         seconds_per_path: |_, _| 0.0,
         uniform_fraction: 0.1,
-        cost_ratio: 0.03,
+        cost_ratio: 0.1,
         refine: true,
         fit: |o, r, _, p| TableGuide::fit(Kind::Emitter, o, r, p),
         restore: |c| TableGuide::restore(Kind::Emitter, c),
@@ -109,7 +110,7 @@ static REGISTRY: [GuideSpec; 5] = [
         validate: |o| Kind::Light.validate(o),
         seconds_per_path: |_, _| 0.0,
         uniform_fraction: 0.1,
-        cost_ratio: 0.03,
+        cost_ratio: 0.25,
         refine: true,
         fit: |o, r, _, p| TableGuide::fit(Kind::Light, o, r, p),
         restore: |c| TableGuide::restore(Kind::Light, c),

@@ -12,7 +12,7 @@ use crate::options::{Budget, PassPlan};
 use crate::progress::Phase;
 
 /// Learning again must promise to take no more than this share of the time that is left.
-const RELEARNING_TIME: f64 = 0.25;
+const RELEARNING_TIME: f64 = 0.05;
 
 /// What the next pass's numbers are drawn with, and how it came about.
 #[derive(Default)]
