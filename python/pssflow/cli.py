@@ -128,7 +128,9 @@ def _render_options(command: F) -> F:
                 help="How the light is joined.  [default: mis]",
             ),
             click.option(
-                "--pilot-spp", type=click.IntRange(1), help="Pilot.  [default: a quarter of --spp]"
+                "--pilot-spp",
+                type=click.IntRange(1),
+                help="Pilot.  [default: an eighth of --spp; a quarter for flows]",
             ),
             click.option(
                 "--keep-pilot/--discard-pilot",
