@@ -95,7 +95,7 @@ def demo(
         for parametrisation in PARAMETRISATIONS:
             for method in METHODS:
                 terminal.say(f"rendering {parametrisation}: {method.title}")
-                arguments = {"preset": "thesis"} | method.arguments
+                arguments: dict[str, Any] = {"preset": "thesis"} | method.arguments
                 runs[parametrisation, method.name] = scene.render(
                     method.guide, parametrisation=parametrisation, **arguments
                 )
