@@ -66,7 +66,7 @@ pub(crate) struct HeldOut<'a> {
     side: usize,
     /// By tile: 1 ÷ (paths · (Ī² + ε)), 0 for tiles without light.
     scale: Vec<f64>,
-    /// Σ over tiles of Ī² ÷ (Ī² + ε).
+    /// Σ over tiles of an unbiased estimate of I² ÷ (Ī² + ε).
     square: f64,
     /// V(1).
     uniform: f64,
@@ -85,18 +85,24 @@ impl<'a> HeldOut<'a> {
             uniform: 0.0,
         };
         let each = paths / (side * side) as f64;
-        let mut means = vec![0.0; side * side];
+        let (mut means, mut squares) = (vec![0.0; side * side], vec![0.0; side * side]);
         for row in held.rows() {
-            means[held.tile(row)] += held.records.terms(row).value() / each;
+            let share = held.records.terms(row).value() / each;
+            means[held.tile(row)] += share;
+            squares[held.tile(row)] += share * share;
         }
         let mean = means.iter().sum::<f64>() / means.len() as f64;
         let epsilon = (0.1 * mean).powi(2);
         if !(mean > 0.0 && mean.is_finite()) {
             return None;
         }
-        for (scale, mean) in held.scale.iter_mut().zip(&means) {
-            *scale = 1.0 / (each * (mean * mean + epsilon));
-            held.square += mean * mean / (mean * mean + epsilon);
+        // The square of a mean of n paths is too large by a share 1/n of their variance, and a large gain is what is left
+        // of V after it: products of different paths alone are unbiased.
+        let pairs = each / (each - 1.0).max(1.0);
+        for ((scale, mean), own) in held.scale.iter_mut().zip(&means).zip(&squares) {
+            let size = mean * mean + epsilon;
+            *scale = 1.0 / (each * size);
+            held.square += pairs * (mean * mean - own) / size;
         }
         let one = vec![1.0; held.records.f.len()];
         let one = Densities {
@@ -105,7 +111,7 @@ impl<'a> HeldOut<'a> {
         };
         held.uniform = held.variance(&one, 1.0);
         // Below that, what looks like variance is rounding.
-        (held.uniform > 1e-6 * held.square).then_some(held)
+        (held.uniform > 1e-6 * held.square.abs()).then_some(held)
     }
 
     /// The paths.
@@ -139,8 +145,8 @@ impl<'a> HeldOut<'a> {
     }
 
     fn rows(&self) -> impl Iterator<Item = usize> + use<'a> {
-        let (f, g) = (self.records.f, self.records.g);
-        (0..f.len()).filter(move |&r| f[r].is_finite() && g[r].is_finite() && g[r] > 0.0)
+        let records = self.records;
+        (0..records.f.len()).filter(move |&row| records.is_sound(row))
     }
 
     fn tile(&self, row: usize) -> usize {

@@ -118,6 +118,22 @@ impl Records<'_> {
         self.contexts.get(at).copied().unwrap_or_default()
     }
 
+    /// Whether all that a row holds is finite, its densities positive and its numbers in the cube.
+    pub(crate) fn is_sound(&self, row: usize) -> bool {
+        self.f[row].is_finite()
+            && self.f_max[row].is_finite()
+            && self.g[row].is_finite()
+            && self.g[row] > 0.0
+            && self.f_bsdf.get(row).is_none_or(|f| f.is_finite())
+            && self
+                .g_bsdf
+                .get(row)
+                .is_none_or(|&g| g.is_finite() && g > 0.0)
+            && self.u[row * self.dims..(row + 1) * self.dims]
+                .iter()
+                .all(|u| (0.0..1.0).contains(u))
+    }
+
     /// Paths drawn, those without light among them.
     pub(crate) fn paths(&self) -> f64 {
         self.f.len() as f64 + self.zeros as f64
@@ -204,20 +220,9 @@ impl Records<'_> {
             }
         }
 
-        let finite = |r: usize| {
-            self.f[r].is_finite()
-                && self.f_max[r].is_finite()
-                && self.g[r].is_finite()
-                && self.g[r] > 0.0
-                && self.f_bsdf.get(r).is_none_or(|f| f.is_finite())
-                && self.g_bsdf.get(r).is_none_or(|&g| g.is_finite() && g > 0.0)
-                && self.u[r * self.dims..(r + 1) * self.dims]
-                    .iter()
-                    .all(|u| (0.0..1.0).contains(u))
-        };
         let (mut kept, mut nonfinite) = (Vec::with_capacity(rows), 0);
         for r in 0..rows {
-            if !finite(r) {
+            if !self.is_sound(r) {
                 nonfinite += 1;
             } else if self.f_max[r] > 0.0 {
                 kept.push(r);

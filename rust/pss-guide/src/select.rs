@@ -128,6 +128,8 @@ pub fn select(
 ) -> Result<Selection, GuideError> {
     let (fitted_to, held) = split(records);
     let (fitted_to, held) = (fitted_to.view(records), held.view(records));
+    // The winner is fitted again to all of them.
+    let growth = records.f.len() as f64 / (fitted_to.f.len() as f64).max(1.0);
     let least = least_gain(held.f.len());
     let mut considered = vec![Considered::none()];
     if let Some(held) = HeldOut::new(held) {
@@ -138,7 +140,15 @@ pub fn select(
             };
             let share = |done: f32| 0.7 * (i as f32 + done) / candidates.len() as f32;
             let mut progress = |done| progress(share(done));
-            match consider(&family, &fitted_to, &held, remaining, seed, &mut progress) {
+            match consider(
+                &family,
+                &fitted_to,
+                growth,
+                &held,
+                remaining,
+                seed,
+                &mut progress,
+            ) {
                 Ok(members) => considered.extend(members),
                 Err(GuideError::TooFewPaths { .. }) => {}
                 Err(e) => return Err(e),
@@ -203,10 +213,12 @@ impl Considered {
     }
 }
 
-/// Fits the factors of a composite, and predicts the gain of all subsets of them.
+/// Fits the factors of a composite, and predicts the gain of all subsets of them; a fit to all paths has `growth` times
+/// as many.
 fn consider(
     family: &Recipe,
     fitted_to: &Records<'_>,
+    growth: f64,
     held: &HeldOut<'_>,
     remaining: &Remaining,
     seed: u64,
@@ -237,7 +249,9 @@ fn consider(
             .fold((1.0, 0.0), |best, g| if g.1 > best.1 { g } else { best });
         let cost_ratio: f64 = factors.iter().map(|&i| costs[i]).sum();
         let recipe = family.subset(&factors);
-        let training_share = training_share(&recipe, fitted_to, seconds, remaining);
+        let own = factors.len() as f64 / fits.len() as f64;
+        let training_share = growth * training_share(&recipe, fitted_to, seconds * own, remaining);
+        let training_share = training_share.min(1.0);
         members.push(Considered {
             report: CandidateReport {
                 name: recipe.label(),
