@@ -14,6 +14,10 @@ use crate::progress::Phase;
 /// Learning again must promise to take no more than this share of the time that is left.
 const RELEARNING_TIME: f64 = 0.05;
 
+/// Where a chooser picked nothing from as many light-carrying paths, more would not change its mind: keeping them and
+/// choosing again only costs.
+const ENOUGH_FOR_NONE: usize = 1 << 16;
+
 /// What the next pass's numbers are drawn with, and how it came about.
 #[derive(Default)]
 pub(crate) struct Current {
@@ -126,6 +130,7 @@ impl Run<'_> {
             }
             (None, _) => {
                 self.current.guide = None;
+                self.current.settled = self.records.len() >= ENOUGH_FOR_NONE;
                 Ok(())
             }
         }
