@@ -19,6 +19,7 @@ mod hierarchical;
 mod interaction;
 pub mod math;
 pub mod numbers;
+mod packet;
 pub mod path;
 pub mod paths;
 mod scene;

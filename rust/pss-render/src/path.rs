@@ -14,7 +14,7 @@
 //! tracer asks a [`NumberSource`] what the stage's numbers shall be. Radiance in W·sr⁻¹·m⁻², linear sRGB.
 //! This module draws no number, allocates nothing per path, and knows neither guides nor Python.
 
-use embree4::{Hit, Ray};
+use embree4::{Hit, PACKET_WIDTH, Ray};
 use serde::{Deserialize, Serialize};
 
 use crate::bsdf::{BsdfSample, ShadingPoint, reuse};
@@ -23,6 +23,7 @@ use crate::error::TraceError;
 use crate::interaction::Interaction;
 use crate::math::{Frame, Rgb, Vec3};
 use crate::numbers::{Lanes, NumberSource, VertexContext};
+use crate::packet::Packet;
 use crate::paths::{Paths, State};
 use crate::scene::{BsdfTraits, Scene};
 use crate::warp::{
@@ -54,6 +55,18 @@ impl Parametrisation {
             Self::Uniform => "uniform",
         }
     }
+}
+
+/// A BSDF-sampled ray from x_k under way.
+#[derive(Clone, Copy, Default)]
+struct Scattered {
+    lane: usize,
+    /// x_k.
+    from: Vec3,
+    /// β_k · f_s · |cos θ| ÷ p.
+    throughput: Rgb,
+    /// p in solid angle; `None` for a delta lobe, which has no rival.
+    pdf: Option<f32>,
 }
 
 /// Turns numbers into radiance, for one scene and one table of columns.
@@ -112,11 +125,7 @@ impl<'a> Tracer<'a> {
         // ---------------- Camera → x₁ → … → x_k ----------------
         self.camera_rays(paths);
         for b in 1..=k {
-            if b == 1 {
-                self.first_vertices(paths);
-            } else {
-                self.next_vertices(paths);
-            }
+            self.vertices(paths, b);
             self.record_contexts(paths, b);
             if b < k {
                 self.ask(paths, numbers, Decision::Direction(b));
@@ -200,58 +209,45 @@ impl<'a> Tracer<'a> {
             }));
     }
 
-    /// x₁, by coherent packets: neighbours in a block are neighbours on the film.
-    fn first_vertices(&self, paths: &mut Paths) {
-        let mut kept = 0;
-        let mut rays = [Ray::new([0.0; 3], [0.0, 0.0, 1.0]); 16];
-        let mut hits: [Option<Hit>; 16] = [None; 16];
-        for start in (0..paths.active.len()).step_by(16) {
-            let n = (paths.active.len() - start).min(16);
-            for (ray, &lane) in rays.iter_mut().zip(&paths.active[start..start + n]) {
-                *ray = paths.states[lane as usize].ray;
+    /// x_b, by packets. Camera rays are coherent: neighbours in a block are neighbours on the film.
+    fn vertices(&self, paths: &mut Paths, b: usize) {
+        let (accel, camera) = (self.scene.accel(), b == 1);
+        let Paths {
+            active,
+            states,
+            rays: log,
+            ..
+        } = paths;
+        let mut packet = Packet::new();
+        let (mut next, mut kept) = (0, 0);
+        while next < active.len() {
+            for &lane in active[next..].iter().take(PACKET_WIDTH) {
+                packet.push(states[lane as usize].ray, lane);
+                next += 1;
             }
-            if let Some(log) = &mut paths.rays {
-                log.camera.extend_from_slice(&rays[..n]);
+            if let Some(log) = log {
+                log.of(camera).extend_from_slice(packet.rays());
             }
-            self.scene
-                .accel()
-                .intersect_packet16(&rays[..n], &mut hits[..n], true);
-            for (i, hit) in hits[..n].iter().enumerate() {
-                let lane = paths.active[start + i];
-                let state = &mut paths.states[lane as usize];
-                let hit = hit.and_then(|hit| self.scene.behind_emitters(&mut state.ray, hit));
+            packet.intersect(accel, camera, |lane, _, hit| {
+                let state = &mut states[lane as usize];
+                let hit = match hit {
+                    Some(hit) if camera => self.scene.behind_emitters(&mut state.ray, hit),
+                    hit => hit,
+                };
                 if let Some(hit) = hit {
                     self.arrive(state, &hit);
-                    paths.active[kept] = lane;
+                    active[kept] = lane;
                     kept += 1;
                 }
-            }
+            });
         }
-        paths.active.truncate(kept);
-    }
-
-    /// x_b for b > 1, ray by ray: packets do not help incoherent rays.
-    fn next_vertices(&self, paths: &mut Paths) {
-        let (states, log) = (&mut paths.states, &mut paths.rays);
-        paths.active.retain(|&lane| {
-            let state = &mut states[lane as usize];
-            if let Some(log) = log {
-                log.next.push(state.ray);
-            }
-            match self.scene.accel().intersect(&state.ray) {
-                Some(hit) => {
-                    self.arrive(state, &hit);
-                    true
-                }
-                None => false,
-            }
-        });
+        active.truncate(kept);
     }
 
     /// Sets up shading at a hit.
     #[inline]
     fn arrive(&self, state: &mut State, hit: &Hit) {
-        state.si = self.scene.interaction(&state.ray, hit);
+        state.si = self.scene.shading(&state.ray, hit);
         // Numbers are measured in a frame of the normal alone, so that neighbours agree; only where the
         // azimuth matters is it the uv frame.
         state.frame = if self.bsdf_traits(state).anisotropic {
@@ -345,8 +341,10 @@ impl<'a> Tracer<'a> {
     /// The first term of f: a point on the chosen emitter, joined to x_k by a shadow ray.
     fn next_event(&self, paths: &mut Paths) {
         let mis = self.columns.strategy() == EmitterStrategy::Mis;
-        for &lane in &paths.active {
-            let lane = lane as usize;
+        let accel = self.scene.accel();
+        let mut packet = Packet::new();
+        for i in 0..paths.active.len() {
+            let lane = paths.active[i] as usize;
             let state = &paths.states[lane];
             if state.emitter_probability <= 0.0 || !self.bsdf_traits(state).smooth {
                 continue;
@@ -377,16 +375,19 @@ impl<'a> Tracer<'a> {
             if let Some(log) = &mut paths.rays {
                 log.shadow.push(ray);
             }
-            if !self.scene.accel().occluded(&ray) {
-                paths.f_nee[lane] = f;
+            if packet.push(ray, (lane, f)) {
+                packet.unoccluded(accel, |(lane, f)| paths.f_nee[lane] = f);
             }
         }
+        packet.unoccluded(accel, |(lane, f)| paths.f_nee[lane] = f);
     }
 
     /// The second term of f: a BSDF-sampled ray from x_k that meets an emitter.
     fn bsdf_rays(&self, paths: &mut Paths) {
-        for &lane in &paths.active {
-            let lane = lane as usize;
+        let accel = self.scene.accel();
+        let mut packet = Packet::new();
+        for i in 0..paths.active.len() {
+            let lane = paths.active[i] as usize;
             let state = &paths.states[lane];
             let u = paths.pair(lane, Decision::BsdfRay);
             let Some(sample) = self
@@ -399,37 +400,54 @@ impl<'a> Tracer<'a> {
             if throughput.max_element() <= 0.0 {
                 continue;
             }
-            let d = state.frame.to_world(sample.wo);
-            let ray = state.si.spawn_ray(d);
+            let ray = state.si.spawn_ray(state.frame.to_world(sample.wo));
             if let Some(log) = &mut paths.rays {
                 log.next.push(ray);
             }
-            let surface = self.scene.intersect(&ray);
-            let mut f = Rgb::ZERO;
-            let mut arrives = |e: usize| {
-                let emitter = self.scene.emitters()[e].model();
-                let radiance = emitter.eval(self.scene, d, surface.as_ref());
-                if radiance == Rgb::ZERO {
-                    return;
-                }
-                let weight = if sample.delta {
-                    1.0
-                } else {
-                    let p_nee = self.scene.emitter_choice().probability(e)
-                        * emitter.pdf_direction(self.scene, state.si.p, d, surface.as_ref());
-                    sample.pdf / (sample.pdf + p_nee)
-                };
-                f += throughput * radiance * weight;
+            let scattered = Scattered {
+                lane,
+                from: state.si.p,
+                throughput,
+                pdf: (!sample.delta).then_some(sample.pdf),
             };
-            match &surface {
-                Some(si) => {
-                    if let Some(e) = self.scene.common(si.shape as usize).emitter {
-                        arrives(e);
-                    }
-                }
-                None => self.scene.environments().iter().for_each(|&e| arrives(e)),
+            if packet.push(ray, scattered) {
+                packet.intersect(accel, false, |s, ray, hit| {
+                    paths.f_bsdf[s.lane] = self.arriving(&s, ray, hit.as_ref());
+                });
             }
-            paths.f_bsdf[lane] = f;
+        }
+        packet.intersect(accel, false, |s, ray, hit| {
+            paths.f_bsdf[s.lane] = self.arriving(&s, ray, hit.as_ref());
+        });
+    }
+
+    /// What a BSDF-sampled ray brings back from the emitter that it meets, weighted.
+    fn arriving(&self, from: &Scattered, ray: &Ray, hit: Option<&Hit>) -> Rgb {
+        let d = Vec3::from_array(ray.dir);
+        let brought = |e: usize, surface: Option<&Interaction>| {
+            let emitter = self.scene.emitters()[e].model();
+            let radiance = emitter.eval(self.scene, d, surface);
+            if radiance == Rgb::ZERO {
+                return Rgb::ZERO;
+            }
+            let weight = from.pdf.map_or(1.0, |pdf| {
+                let p_nee = self.scene.emitter_choice().probability(e)
+                    * emitter.pdf_direction(self.scene, from.from, d, surface);
+                pdf / (pdf + p_nee)
+            });
+            from.throughput * radiance * weight
+        };
+        match hit {
+            // Most surfaces shine not at all: their shading is nobody's business then.
+            Some(hit) => self.scene.emitter_at(hit).map_or(Rgb::ZERO, |e| {
+                brought(e, Some(&self.scene.interaction(ray, hit)))
+            }),
+            None => self
+                .scene
+                .environments()
+                .iter()
+                .map(|&e| brought(e, None))
+                .sum(),
         }
     }
 

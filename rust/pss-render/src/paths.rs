@@ -1,6 +1,6 @@
 //! A block of paths, structure of arrays: what the main loop reads and writes.
 
-use embree4::{Hit, Ray};
+use embree4::{Hit, PACKET_WIDTH, Ray};
 
 use crate::columns::{Columns, Decision};
 use crate::error::TraceError;
@@ -46,13 +46,22 @@ pub struct Paths {
 pub struct RayLog {
     /// Camera rays, in coherent packets.
     pub camera: Vec<Ray>,
-    /// Nearest hits, one by one.
+    /// Rays from a surface to the nearest hit, in packets as they come.
     pub next: Vec<Ray>,
     /// Shadow rays.
     pub shadow: Vec<Ray>,
 }
 
 impl RayLog {
+    /// Where the camera's or later rays go.
+    pub(crate) fn of(&mut self, camera: bool) -> &mut Vec<Ray> {
+        if camera {
+            &mut self.camera
+        } else {
+            &mut self.next
+        }
+    }
+
     /// Number of rays.
     pub fn len(&self) -> usize {
         self.camera.len() + self.next.len() + self.shadow.len()
@@ -66,17 +75,21 @@ impl RayLog {
     /// Sends them again, as [`crate::Tracer::trace`] does, and returns how many met something.
     pub fn replay(&self, accel: &embree4::Scene) -> u64 {
         let mut met = 0;
-        let mut hits: [Option<Hit>; 16] = [None; 16];
-        for rays in self.camera.chunks(16) {
+        let mut hits: [Option<Hit>; PACKET_WIDTH] = [None; PACKET_WIDTH];
+        for rays in self.camera.chunks(PACKET_WIDTH) {
             accel.intersect_packet16(rays, &mut hits[..rays.len()], true);
             met += hits[..rays.len()].iter().flatten().count() as u64;
         }
-        met += self
-            .next
-            .iter()
-            .filter(|ray| accel.intersect(ray).is_some())
-            .count() as u64;
-        met + self.shadow.iter().filter(|ray| accel.occluded(ray)).count() as u64
+        for rays in self.next.chunks(PACKET_WIDTH) {
+            accel.intersect_packet16(rays, &mut hits[..rays.len()], false);
+            met += hits[..rays.len()].iter().flatten().count() as u64;
+        }
+        let mut blocked = [false; PACKET_WIDTH];
+        for rays in self.shadow.chunks(PACKET_WIDTH) {
+            accel.occluded_packet16(rays, &mut blocked[..rays.len()], false);
+            met += blocked[..rays.len()].iter().filter(|&&b| b).count() as u64;
+        }
+        met
     }
 }
 

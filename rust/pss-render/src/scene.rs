@@ -15,7 +15,7 @@ use crate::interaction::Interaction;
 use crate::math::{Rgb, Vec3};
 use crate::sensor::Sensor;
 use crate::shape::attribute::Attributes;
-use crate::shape::{Common, Shape};
+use crate::shape::{Common, Shape, Tangents};
 use crate::texture::Texture;
 
 /// Counts and sizes, for `pssflow info` and the statistics of a render.
@@ -338,11 +338,31 @@ impl Scene {
     pub fn interaction(&self, ray: &Ray, hit: &Hit) -> Interaction {
         match hit.inst {
             None => {
-                let mut si = self.shapes[hit.geom as usize].interaction(ray, hit);
+                let mut si = self.shapes[hit.geom as usize].interaction(ray, hit, Tangents::Wanted);
                 si.shape = hit.geom;
                 si
             }
             Some(instance) => self.instanced(instance, ray, hit),
+        }
+    }
+
+    /// The same, without tangents where the BSDF there asks for none.
+    #[inline]
+    pub(crate) fn shading(&self, ray: &Ray, hit: &Hit) -> Interaction {
+        if hit.inst.is_some() || self.traits[self.commons[hit.geom as usize].bsdf].anisotropic {
+            return self.interaction(ray, hit);
+        }
+        let mut si = self.shapes[hit.geom as usize].interaction(ray, hit, Tangents::Unused);
+        si.shape = hit.geom;
+        si
+    }
+
+    /// The emitter on the surface at a hit; groups' shapes are none.
+    #[inline]
+    pub(crate) fn emitter_at(&self, hit: &Hit) -> Option<usize> {
+        match hit.inst {
+            None => self.commons[hit.geom as usize].emitter,
+            Some(_) => None,
         }
     }
 
@@ -352,7 +372,7 @@ impl Scene {
             return Interaction::default();
         };
         let shape = self.group_starts[instance.group()] + hit.geom as usize;
-        let mut si = self.shapes[shape].interaction(&instance.to_group(ray), hit);
+        let mut si = self.shapes[shape].interaction(&instance.to_group(ray), hit, Tangents::Wanted);
         instance.place(&mut si);
         si.shape = shape as u32;
         si

@@ -6,7 +6,7 @@ use embree4::{GeomId, Hit, Quadric, Ray, SceneBuilder};
 use glam::Vec2;
 use serde::Deserialize;
 
-use super::ShapeModel;
+use super::{ShapeModel, Tangents};
 use super::affine::Affine;
 use crate::bsdf::BsdfId;
 use crate::arrays::Arrays;
@@ -57,7 +57,7 @@ impl ShapeModel for Disk {
         Ok(builder.quadric(Quadric::Disk { to_world: self.map.rows() })?)
     }
 
-    fn interaction(&self, ray: &Ray, hit: &Hit) -> Interaction {
+    fn interaction(&self, ray: &Ray, hit: &Hit, _tangents: Tangents) -> Interaction {
         let q = Vec3::from_array(ray.origin) + Vec3::from_array(ray.dir) * hit.t;
         // Back into the plane: q has the error of a distant origin.
         let center = self.map.to_world.translation;

@@ -4,7 +4,7 @@ use embree4::{GeomId, Hit, Ray, SceneBuilder};
 use glam::Vec2;
 use serde::Deserialize;
 
-use super::ShapeModel;
+use super::{ShapeModel, Tangents};
 use super::affine::Affine;
 use crate::arrays::Arrays;
 use crate::bsdf::BsdfId;
@@ -93,7 +93,7 @@ impl ShapeModel for Instance {
     }
 
     /// What a ray meets is a shape of the group, never the instance itself.
-    fn interaction(&self, _ray: &Ray, _hit: &Hit) -> Interaction {
+    fn interaction(&self, _ray: &Ray, _hit: &Hit, _tangents: Tangents) -> Interaction {
         Interaction::default()
     }
 

@@ -6,7 +6,7 @@ use embree4::{GeomId, Hit, Ray, SceneBuilder, Shared};
 use glam::Vec2;
 use serde::Deserialize;
 
-use super::ShapeModel;
+use super::{ShapeModel, Tangents};
 use super::attribute::{self, Attribute, Loose, Per};
 use crate::bsdf::BsdfId;
 use crate::arrays::{ArrayRef, Arrays};
@@ -151,6 +151,19 @@ impl Mesh {
         Vec3::from_slice(&self.positions[3 * i..3 * i + 3])
     }
 
+    /// ∂p/∂u and ∂p/∂v of a triangle with two edges, texture coordinates and a normal.
+    fn tangents(&self, e1: Vec3, e2: Vec3, [t0, t1, t2]: [Vec2; 3], n: Vec3) -> (Vec3, Vec3) {
+        let (d1, d2) = (t1 - t0, t2 - t0);
+        let det = d1.perp_dot(d2);
+        if det == 0.0 {
+            // Coordinates that are all the same, say: Mitsuba takes arbitrary tangents, of the normal before it is
+            // flipped. These are the same, so that bumps and anisotropic lobes are.
+            coordinate_system(n * self.sign)
+        } else {
+            ((e1 * d2.y - e2 * d1.y) / det, (e2 * d1.x - e1 * d2.x) / det)
+        }
+    }
+
     /// Interpolated vertex normal, not normalised.
     #[inline]
     fn normal(normals: &[f32], face: [usize; 3], b: [f32; 3]) -> Vec3 {
@@ -170,7 +183,7 @@ impl ShapeModel for Mesh {
     }
 
     #[inline]
-    fn interaction(&self, _ray: &Ray, hit: &Hit) -> Interaction {
+    fn interaction(&self, _ray: &Ray, hit: &Hit, tangents: Tangents) -> Interaction {
         let face = self.face(hit.prim as usize);
         let [p0, p1, p2] = face.map(|i| self.position(i));
         let b = [1.0 - hit.u - hit.v, hit.u, hit.v];
@@ -185,17 +198,12 @@ impl ShapeModel for Mesh {
         };
         let (uv, dp_du, dp_dv) = match &self.texcoords {
             Some(texcoords) => {
-                let [t0, t1, t2] = face.map(|i| texcoord(texcoords, i));
-                let (d1, d2) = (t1 - t0, t2 - t0);
-                let det = d1.perp_dot(d2);
-                let (dp_du, dp_dv) = if det == 0.0 {
-                    // Coordinates that are all the same, say: Mitsuba takes arbitrary tangents, of the normal before it
-                    // is flipped. These are the same, so that bumps and anisotropic lobes are.
-                    coordinate_system(n * self.sign)
-                } else {
-                    ((e1 * d2.y - e2 * d1.y) / det, (e2 * d1.x - e1 * d2.x) / det)
+                let t = face.map(|i| texcoord(texcoords, i));
+                let (dp_du, dp_dv) = match tangents {
+                    Tangents::Wanted => self.tangents(e1, e2, t, n),
+                    Tangents::Unused => (Vec3::ZERO, Vec3::ZERO),
                 };
-                (t0 * b[0] + t1 * b[1] + t2 * b[2], dp_du, dp_dv)
+                (t[0] * b[0] + t[1] * b[1] + t[2] * b[2], dp_du, dp_dv)
             }
             None => (Vec2::new(b[1], b[2]), e1, e2),
         };

@@ -30,6 +30,15 @@ pub struct SurfaceSample {
     pub pdf: f32,
 }
 
+/// Whether ∂p/∂u and ∂p/∂v are of interest; only few BSDFs look at them, and on a mesh they take a third of the work.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Tangents {
+    /// They must be right.
+    Wanted,
+    /// They may be anything.
+    Unused,
+}
+
 /// What each shape file provides.
 pub(crate) trait ShapeModel {
     /// Hands the geometry to Embree. `groups`: what instances are views of.
@@ -40,7 +49,7 @@ pub(crate) trait ShapeModel {
     ) -> Result<GeomId, SceneError>;
 
     /// The surface at a hit; `shape` is filled in by the caller.
-    fn interaction(&self, ray: &Ray, hit: &Hit) -> Interaction;
+    fn interaction(&self, ray: &Ray, hit: &Hit, tangents: Tangents) -> Interaction;
 
     /// Surface area, world space.
     fn area(&self) -> f32;
@@ -138,8 +147,8 @@ macro_rules! registry {
 
             /// The surface at a hit.
             #[inline]
-            pub(crate) fn interaction(&self, ray: &Ray, hit: &Hit) -> Interaction {
-                match self { $(Self::$variant(s) => s.interaction(ray, hit),)* }
+            pub(crate) fn interaction(&self, ray: &Ray, hit: &Hit, tangents: Tangents) -> Interaction {
+                match self { $(Self::$variant(s) => s.interaction(ray, hit, tangents),)* }
             }
 
             /// The plugin's name.

@@ -5,7 +5,7 @@ use embree4::{GeomId, Hit, Ray, SceneBuilder};
 use glam::Vec2;
 use serde::Deserialize;
 
-use super::ShapeModel;
+use super::{ShapeModel, Tangents};
 use super::affine::Affine;
 use super::mesh::Mesh;
 use crate::bsdf::BsdfId;
@@ -68,8 +68,8 @@ impl ShapeModel for Rectangle {
     }
 
     #[inline]
-    fn interaction(&self, ray: &Ray, hit: &Hit) -> Interaction {
-        self.mesh.interaction(ray, hit)
+    fn interaction(&self, ray: &Ray, hit: &Hit, tangents: Tangents) -> Interaction {
+        self.mesh.interaction(ray, hit, tangents)
     }
 
     fn area(&self) -> f32 {

@@ -7,7 +7,7 @@ use glam::Vec2;
 use serde::Deserialize;
 
 use super::affine::Affine;
-use super::{ShapeModel, SurfaceSample, solid_angle_pdf};
+use super::{ShapeModel, SurfaceSample, Tangents, solid_angle_pdf};
 use crate::bsdf::BsdfId;
 use crate::arrays::{Arrays, check};
 use crate::error::SceneError;
@@ -98,7 +98,7 @@ impl ShapeModel for Sphere {
         })?)
     }
 
-    fn interaction(&self, ray: &Ray, hit: &Hit) -> Interaction {
+    fn interaction(&self, ray: &Ray, hit: &Hit, _tangents: Tangents) -> Interaction {
         // Projected back onto the sphere: origin + t·d has the error of a distant origin.
         let q = Vec3::from_array(ray.origin) + Vec3::from_array(ray.dir) * hit.t;
         let out = (q - self.center).normalize();
