@@ -67,7 +67,7 @@ pub(super) fn inverse_erfc(c: f32) -> f32 {
     let p = p * v + 0.005_739_508;
     let p = p * v - 0.007_622_461_3;
     let p = p * v + 0.009_438_870_5;
-    let p = p * v + 1.001_674_1;
+    let p = p * v + 1.001_674;
     let tail = p * v + 2.832_976_8;
     x * if w < 5.0 { centre } else { tail }
 }

@@ -63,7 +63,7 @@ impl Axis {
     #[inline(always)]
     fn new(mean: f32, spread: f32) -> Self {
         let mu = 0.5 + 0.5 * tanh(mean);
-        let inv = 7.071_067_8 * exp(-3.0 * tanh(spread * (1.0 / 3.0)));
+        let inv = 7.071_068 * exp(-3.0 * tanh(spread * (1.0 / 3.0)));
         Self {
             mu,
             inv,
