@@ -328,7 +328,8 @@ def test_learned_numbers_give_mitsubas_mean(
     assert r.has_power, r.explain(artifacts)
 
 
-TABLES = ("direction-table", "emitter-table", "light-table", "table", "auto")
+NET = "mixture-net+emitter-table+light-table"
+TABLES = ("direction-table", "emitter-table", "light-table", "table", "mixture-net", NET, "auto")
 
 
 def _table_cases() -> list[Any]:
@@ -338,6 +339,8 @@ def _table_cases() -> list[Any]:
         ("glossy_room", "table", 0.1, 2, "mis"),
         ("open_sky", "table", 0.5, 2, "mis"),
         ("sun_and_sky", "table", 0.1, 3, "mis"),
+        ("cornell-box", "mixture-net", 0.1, 3, "mis"),
+        ("sun_and_sky", NET, 0.5, 2, "mis"),
         ("sun_and_sky", "auto", 0.1, 2, "nee"),
         ("glass_room", "auto", 0.1, 2, "mis"),
     }
@@ -357,7 +360,7 @@ def _table_cases() -> list[Any]:
 def test_tables_give_mitsubas_mean(
     name: str, guide: str, a: float, k: int, strategy: str, artifacts: Path, record
 ) -> None:
-    """H0: tables that are refined from pass to pass have the truth as mean, all passes kept."""
+    """H0: tables and nets that are refined from pass to pass have the truth as mean, all passes kept."""
     options = {"guide": guide, "uniform_fraction": a, "emitter_strategy": strategy, "k": k}
     r = welch(_truth(name, k), _ours(name, **options))
     record |= {"p": r.p, "largest sample's share": max(r.heaviest)}

@@ -18,6 +18,7 @@ mod composite;
 mod error;
 mod file;
 mod flow;
+mod net;
 mod normal;
 mod options;
 mod predict;
@@ -34,6 +35,7 @@ use serde::{Deserialize, Serialize};
 pub use error::GuideError;
 pub use file::{Contents, FORMAT_VERSION, load, load_unchecked};
 pub use flow::options::{Prior, RealNvpOptions};
+pub use net::options::MixtureNetOptions;
 pub use recipe::{ALIASES, Recipe};
 pub use records::{Emitter, Records};
 pub use registry::{FitFn, GuideSpec, find, fit, registry};
@@ -151,7 +153,8 @@ pub trait Guide: Send + Sync + std::fmt::Debug {
 pub struct EpochLoss {
     /// Epoch, from 1.
     pub epoch: usize,
-    /// Mean of −ln q(u) over the training set, in nats; 0 is the uniform density.
+    /// Of a flow: mean of −ln q(u) over the training set, in nats; 0 is the uniform density. Of a net: the second moment of
+    /// the mixture's estimate over that of the uniform one, so 1 is the uniform density.
     pub loss: f64,
 }
 

@@ -81,6 +81,12 @@ impl Recipe {
         self.factors.iter().map(each).sum()
     }
 
+    /// Seconds of training on one core, at most, that come to it however many paths there are.
+    pub fn seconds(&self, dims: usize) -> f64 {
+        let each = |(spec, options): &(&GuideSpec, Map<_, _>)| (spec.seconds)(options, dims);
+        self.factors.iter().map(each).sum()
+    }
+
     /// The largest of its factors' shares of uniform paths.
     pub fn uniform_fraction(&self) -> f32 {
         self.specs().map(|s| s.uniform_fraction).fold(0.0, f32::max)

@@ -4,6 +4,7 @@ use serde_json::{Map, Value};
 
 use crate::file::Contents;
 use crate::flow::{Domain, RealNvp, options::RealNvpOptions};
+use crate::net::{Kind as Net, NetGuide};
 use crate::table::{Kind, TableGuide};
 use crate::{Decision, Fit, Guide, GuideError, Recipe, Records, options};
 
@@ -31,13 +32,16 @@ pub struct GuideSpec {
     /// Seconds of training that each path costs on one core, roughly, for (options, columns); 0 where it does
     /// not depend on the number of paths. A render under a time budget gives no more paths than it can afford.
     pub seconds_per_path: fn(&Map<String, Value>, usize) -> f64,
+    /// Seconds of training on one core, at most, that come to it however many paths there are, likewise.
+    pub seconds: fn(&Map<String, Value>, usize) -> f64,
     /// The defensive mixture's share of uniform paths that suits it when nothing is known of the scene.
     pub uniform_fraction: f32,
     /// What it adds to the cost of a path, in uniform paths: time of a guided pass ÷ time of a uniform one, less one. Most
     /// of it is no arithmetic of the guide: guided paths survive longer and send more rays. Selection uses it, and more
     /// where it measures more.
     pub cost_ratio: f64,
-    /// Whether a fit is so cheap (well under a microsecond a path) that a render may repeat it as its paths double.
+    /// Whether a fit is so cheap (under a microsecond a path, or a second or two in all) that a render may repeat it as its
+    /// paths double.
     pub refine: bool,
     /// Fits; see [`fit`].
     pub fit: FitFn,
@@ -45,7 +49,7 @@ pub struct GuideSpec {
     pub(crate) restore: fn(Contents) -> Result<Box<dyn Guide>, String>,
 }
 
-static REGISTRY: [GuideSpec; 5] = [
+static REGISTRY: [GuideSpec; 6] = [
     GuideSpec {
         name: "realnvp",
         summary: "the thesis: RealNVP over all numbers at once, normal prior, samples outside the cube are lost",
@@ -55,6 +59,7 @@ static REGISTRY: [GuideSpec; 5] = [
         seconds_per_path: |o, d| {
             RealNvpOptions::parse(Domain::Cube, o).map_or(0.0, |o| o.seconds_per_path(d))
         },
+        seconds: |_, _| 0.0,
         uniform_fraction: 0.25,
         cost_ratio: 1.3,
         refine: false,
@@ -70,6 +75,7 @@ static REGISTRY: [GuideSpec; 5] = [
         seconds_per_path: |o, d| {
             RealNvpOptions::parse(Domain::Logit, o).map_or(0.0, |o| o.seconds_per_path(d))
         },
+        seconds: |_, _| 0.0,
         uniform_fraction: 0.25,
         cost_ratio: 1.3,
         refine: false,
@@ -83,6 +89,7 @@ static REGISTRY: [GuideSpec; 5] = [
         defaults: || Kind::Direction.defaults(),
         validate: |o| Kind::Direction.validate(o),
         seconds_per_path: |_, _| 0.0,
+        seconds: |_, _| 0.0,
         uniform_fraction: 0.1,
         cost_ratio: 0.5,
         refine: true,
@@ -96,6 +103,7 @@ static REGISTRY: [GuideSpec; 5] = [
         defaults: || Kind::Emitter.defaults(),
         validate: |o| Kind::Emitter.validate(o),
         seconds_per_path: |_, _| 0.0,
+        seconds: |_, _| 0.0,
         uniform_fraction: 0.1,
         cost_ratio: 0.1,
         refine: true,
@@ -109,11 +117,26 @@ static REGISTRY: [GuideSpec; 5] = [
         defaults: || Kind::Light.defaults(),
         validate: |o| Kind::Light.validate(o),
         seconds_per_path: |_, _| 0.0,
+        seconds: |_, _| 0.0,
         uniform_fraction: 0.1,
         cost_ratio: 0.25,
         refine: true,
         fit: |o, r, _, p| TableGuide::fit(Kind::Light, o, r, p),
         restore: |c| TableGuide::restore(Kind::Light, c),
+    },
+    GuideSpec {
+        name: Net::Mixture.name(),
+        summary: "the direction at each vertex: a network of place, normal and view says a mixture of normals",
+        models: &[Decision::Direction],
+        defaults: || Net::Mixture.defaults(),
+        validate: |o| Net::Mixture.validate(o),
+        seconds_per_path: |_, d| Net::seconds_per_path(d),
+        seconds: |o, d| Net::Mixture.seconds(o, d),
+        uniform_fraction: 0.25,
+        cost_ratio: 0.6,
+        refine: true,
+        fit: |o, r, s, p| NetGuide::fit(Net::Mixture, o, r, s, p),
+        restore: |c| NetGuide::restore(Net::Mixture, c),
     },
 ];
 

@@ -24,8 +24,12 @@ const LEAST_GAIN: f64 = 1.05;
 /// A smaller model is taken where it comes as close to the best.
 const AS_GOOD: f64 = 0.98;
 
-/// Training may take this share of the time that is left.
+/// Training may take this share of the time that is left, where it grows with the number of paths and is tried on a part
+/// of them.
 const MOST_TRAINING: f64 = 0.1;
+
+/// The same where it costs as much however few the paths: it is paid once to look, and again to use what was found.
+const MOST_FIXED_TRAINING: f64 = 0.025;
 
 /// Light-carrying paths that are looked at, at most: more would tell little, and the choice must not cost more than it
 /// brings.
@@ -102,6 +106,7 @@ pub fn candidates() -> Result<Vec<Recipe>, GuideError> {
     Ok(vec![
         Recipe::parse("table", &Map::new())?,
         Recipe::parse("table", &stiff)?,
+        Recipe::parse("mixture-net+emitter-table+light-table", &Map::new())?,
     ])
 }
 
@@ -149,7 +154,17 @@ pub fn select(
                 seed,
                 &mut progress,
             ) {
-                Ok(members) => considered.extend(members),
+                Ok(members) => {
+                    for member in members {
+                        // Families share factors.
+                        if considered
+                            .iter()
+                            .all(|c| c.report.name != member.report.name)
+                        {
+                            considered.push(member);
+                        }
+                    }
+                }
                 Err(GuideError::TooFewPaths { .. }) => {}
                 Err(e) => return Err(e),
             }
@@ -224,9 +239,7 @@ fn consider(
     seed: u64,
     progress: &mut dyn FnMut(f32) -> bool,
 ) -> Result<Vec<Considered>, GuideError> {
-    let start = Instant::now();
     let fits = family.fit_factors(fitted_to, seed, progress)?;
-    let seconds = start.elapsed().as_secs_f64();
     let densities: Vec<Densities> = fits
         .iter()
         .map(|fit| Densities::of(&*fit.guide, held.records()))
@@ -249,9 +262,8 @@ fn consider(
             .fold((1.0, 0.0), |best, g| if g.1 > best.1 { g } else { best });
         let cost_ratio: f64 = factors.iter().map(|&i| costs[i]).sum();
         let recipe = family.subset(&factors);
-        let own = factors.len() as f64 / fits.len() as f64;
-        let training_share = growth * training_share(&recipe, fitted_to, seconds * own, remaining);
-        let training_share = training_share.min(1.0);
+        let seconds = factors.iter().map(|&i| fits[i].seconds).sum();
+        let training_share = training_share(&recipe, fitted_to, growth, seconds, remaining);
         members.push(Considered {
             report: CandidateReport {
                 name: recipe.label(),
@@ -283,20 +295,35 @@ fn seconds_left(remaining: &Remaining) -> f64 {
 
 /// Whether training is worth a thought.
 fn affordable(recipe: &Recipe, records: &Records<'_>, remaining: &Remaining) -> bool {
-    let training = recipe.seconds_per_path(records.dims) * records.f.len() as f64;
-    training <= MOST_TRAINING * seconds_left(remaining)
+    let left = seconds_left(remaining);
+    let growing = recipe.seconds_per_path(records.dims) * records.f.len() as f64;
+    let fixed = fixed_seconds(recipe, records, remaining);
+    growing <= MOST_TRAINING * left && fixed <= MOST_FIXED_TRAINING * left
 }
 
-/// Share of the time that is left that fitting to all paths takes: measured on a part of them, or as the registry says.
+/// Seconds on all threads that training takes however many paths there are.
+fn fixed_seconds(recipe: &Recipe, records: &Records<'_>, remaining: &Remaining) -> f64 {
+    recipe.seconds(records.dims) / remaining.threads.max(1) as f64
+}
+
+/// Share of the time that is left that fitting to all paths takes, `growth` times those that it was tried on: measured
+/// there, or as the registry says.
 fn training_share(
     recipe: &Recipe,
     fitted_to: &Records<'_>,
+    growth: f64,
     seconds: f64,
     remaining: &Remaining,
 ) -> f64 {
+    let fixed = fixed_seconds(recipe, fitted_to, remaining);
     let training = match remaining.seconds_per_path {
-        Some(_) => seconds,
-        None => recipe.seconds_per_path(fitted_to.dims) * fitted_to.f.len() as f64,
+        // Which part of a measured time grows is not known; where there is a fixed one, it is by far the larger.
+        Some(_) if fixed > 0.0 => seconds,
+        Some(_) => growth * seconds,
+        None => {
+            let growing = recipe.seconds_per_path(fitted_to.dims) * fitted_to.f.len() as f64;
+            growth * growing + fixed
+        }
     };
     (training / seconds_left(remaining).max(f64::MIN_POSITIVE)).min(1.0)
 }

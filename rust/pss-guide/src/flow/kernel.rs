@@ -14,11 +14,11 @@ use super::weights::{Weights, kept};
 pub(crate) const SLOPE: f32 = 0.01;
 
 /// Outputs of a linear layer that are accumulated together; a multiple of it divides 40.
-const TILE: usize = 5;
+pub(crate) const TILE: usize = 5;
 
 /// A linear layer, outputs padded with zeros to whole tiles.
 #[derive(Clone, Debug)]
-struct Linear {
+pub(crate) struct Linear {
     inputs: usize,
     /// `[tile][input][output of the tile]`
     weights: Vec<[f32; TILE]>,
@@ -119,7 +119,7 @@ impl Kernel {
 }
 
 impl Linear {
-    fn pack(weight: &[f32], bias: &[f32], rows: &[usize], columns: &[usize]) -> Self {
+    pub(crate) fn pack(weight: &[f32], bias: &[f32], rows: &[usize], columns: &[usize]) -> Self {
         let outputs = bias.len();
         let tile = |f: &dyn Fn(usize) -> f32, columns: &[usize]| {
             let mut tile = [0.0; TILE];
@@ -145,7 +145,7 @@ impl Linear {
 
     /// `output[j] = activation(Σ_i w[i][j] · input[i] + b[j])` for one block; `leaky`: LeakyReLU, else none.
     #[inline(always)]
-    fn apply<S: Simd>(&self, simd: S, input: &[f32], output: &mut [f32], leaky: bool) {
+    pub(crate) fn apply<S: Simd>(&self, simd: S, input: &[f32], output: &mut [f32], leaky: bool) {
         let (input, _) = pulp::as_arrays::<2, _>(S::as_simd_f32s(input).0);
         let (output, _) = pulp::as_arrays_mut::<2, _>(S::as_mut_simd_f32s(output).0);
         let input = &input[..self.inputs];
@@ -311,7 +311,7 @@ impl Coupling {
 
 /// exp in f32, relative error below 3e-7, argument clamped to ±87; branch-free, so that loops vectorise.
 #[inline(always)]
-fn exp(x: f32) -> f32 {
+pub(crate) fn exp(x: f32) -> f32 {
     // Adding 1.5·2²³ rounds to an integer that then sits in the low bits of the sum.
     const MAGIC: f32 = 12_582_912.0;
     let x = x.clamp(-87.0, 87.0);
@@ -332,7 +332,7 @@ fn exp(x: f32) -> f32 {
 
 /// tanh in f32, absolute error below 3e-7.
 #[inline(always)]
-fn tanh(x: f32) -> f32 {
+pub(crate) fn tanh(x: f32) -> f32 {
     1.0 - 2.0 / (1.0 + exp(2.0 * x))
 }
 

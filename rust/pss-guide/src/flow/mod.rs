@@ -14,10 +14,10 @@
 //! that 0 is no special case. Start reading at [`RealNvp`]; networks are evaluated by `kernel`, trained by
 //! `train` in candle.
 
-mod kernel;
+pub(crate) mod kernel;
 mod ops;
 pub(crate) mod options;
-mod product;
+pub(crate) mod product;
 #[cfg(test)]
 mod tests;
 mod train;

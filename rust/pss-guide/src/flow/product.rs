@@ -9,7 +9,7 @@ use pulp::{Simd, WithSimd};
 
 /// A matrix seen through strides: element (i, j) is `values[i * row + j * column]`.
 #[derive(Clone, Copy)]
-pub(super) struct Strided<'a> {
+pub(crate) struct Strided<'a> {
     pub(super) values: &'a [f32],
     pub(super) row: usize,
     pub(super) column: usize,
@@ -17,7 +17,7 @@ pub(super) struct Strided<'a> {
 
 impl<'a> Strided<'a> {
     /// A row-major matrix with `columns` columns.
-    pub(super) fn rows(values: &'a [f32], columns: usize) -> Self {
+    pub(crate) fn rows(values: &'a [f32], columns: usize) -> Self {
         Self {
             values,
             row: columns,
@@ -26,7 +26,7 @@ impl<'a> Strided<'a> {
     }
 
     /// The transpose of a row-major matrix with `columns` columns.
-    pub(super) fn transposed(values: &'a [f32], columns: usize) -> Self {
+    pub(crate) fn transposed(values: &'a [f32], columns: usize) -> Self {
         Self {
             values,
             row: 1,
@@ -36,7 +36,7 @@ impl<'a> Strided<'a> {
 }
 
 /// C (m, n) = A (m, k) · B (k, n), C row-major.
-pub(super) fn multiply(c: &mut [f32], [m, k, n]: [usize; 3], a: Strided<'_>, b: Strided<'_>) {
+pub(crate) fn multiply(c: &mut [f32], [m, k, n]: [usize; 3], a: Strided<'_>, b: Strided<'_>) {
     let product = Product { c, m, k, n, a, b };
     #[cfg(target_arch = "x86_64")]
     if let Some(simd) = pulp::x86::V3::try_new() {

@@ -25,11 +25,11 @@ const THIN: f32 = 1e-4;
 
 /// The box that holds 99 % of the vertices along each axis, and its division into 2^depth steps per axis.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Grid {
+pub(crate) struct Grid {
     /// Lower corner.
-    pub(super) origin: [f32; 3],
+    pub(crate) origin: [f32; 3],
     /// Finest steps per unit of length; 0 along an axis that is not divided.
-    pub(super) scale: [f32; 3],
+    pub(crate) scale: [f32; 3],
     /// Levels of division.
     pub(super) depth: usize,
 }
@@ -37,7 +37,7 @@ pub(super) struct Grid {
 impl Grid {
     /// Fits the box; positions that are not finite are passed over. Far outliers would else make the cells of
     /// everything else too large, hence the quantiles.
-    pub(super) fn around(positions: &[[f32; 3]], depth: usize) -> Self {
+    pub(crate) fn around(positions: &[[f32; 3]], depth: usize) -> Self {
         let stride = positions.len().div_ceil(BOX_SAMPLE).max(1);
         let (mut origin, mut extent) = ([0.0; 3], [0.0f32; 3]);
         for axis in 0..3 {

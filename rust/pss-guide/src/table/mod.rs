@@ -10,7 +10,7 @@
 //! trees; here it is f² over the path's primary numbers, so that the BSDF is part of what is learnt.
 
 mod bank;
-mod cells;
+pub(crate) mod cells;
 mod line;
 pub(crate) mod options;
 mod square;

@@ -1,0 +1,339 @@
+//! Nets: a small network looks at a vertex (position, normal, outgoing direction) and says how the two numbers of the
+//! direction there are distributed.
+//!
+//! ```text
+//! context ─ place ─► inputs ─ network (32-32 units) ─► outputs ─ head ─► q(u₀, u₁ | context)
+//! ```
+//!
+//! `mixture-net`'s head is a mixture of truncated normals (`mixture`); its networks are evaluated on blocks of rows (`model`)
+//! and trained on the second moment of the estimate (`train`). All vertices x₁ … x_{k−1} of a path share the network. In a
+//! composite it is fitted on f²/g of what the factors before it leave, as every guide is ([`crate::Recipe::fit`]). Learned mixtures
+//! for path guiding: Huang et al. 2024, doi:10.1145/3649310; here over primary numbers, so that the BSDF is part of what is learnt.
+
+mod math;
+mod mixture;
+mod mlp;
+mod model;
+pub(crate) mod options;
+#[cfg(test)]
+mod tests;
+mod train;
+
+use serde_json::{Map, Value, json};
+
+use self::mlp::{Mlp, Place};
+use self::model::{Head, Model, Packed};
+use self::options::MixtureNetOptions;
+use self::train::Data;
+use crate::file::{self, Contents};
+use crate::records::quantile;
+use crate::{Context, Decision, Fit, Guide, GuideError, Records, options as json_options};
+
+/// Seconds on one core that a decision, forward and back, takes with the default network, as `examples/guide_cost.rs` shows.
+const SECONDS_PER_DECISION: f64 = 1.0e-6;
+
+/// Seconds that preparing a path takes, per number of it.
+const SECONDS_PER_FEATURES: f64 = 2e-8;
+
+/// Which head.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Kind {
+    Mixture,
+}
+
+impl Kind {
+    /// Name in the registry.
+    pub(crate) const fn name(self) -> &'static str {
+        match self {
+            Self::Mixture => "mixture-net",
+        }
+    }
+
+    /// Options with their defaults.
+    pub(crate) fn defaults(self) -> Map<String, Value> {
+        json_options::to_map(&MixtureNetOptions::default())
+    }
+
+    /// Checks options.
+    pub(crate) fn validate(self, given: &Map<String, Value>) -> Result<(), GuideError> {
+        MixtureNetOptions::parse(self, given).map(drop)
+    }
+
+    /// Seconds on one core that a path given costs beside the training: its features and its weight.
+    pub(crate) fn seconds_per_path(dims: usize) -> f64 {
+        SECONDS_PER_FEATURES * dims as f64
+    }
+
+    /// Seconds on one core that a training takes, at most, for paths of `dims` numbers: it shows the network about as many
+    /// paths however many there are.
+    pub(crate) fn seconds(self, given: &Map<String, Value>, dims: usize) -> f64 {
+        let Ok(options) = MixtureNetOptions::parse(self, given) else {
+            return 0.0;
+        };
+        let parameters = |o: &MixtureNetOptions| -> usize {
+            let widths = Head::new(self, o).widths(o);
+            let products = widths
+                .iter()
+                .flat_map(|w| w.windows(2).map(|w| w[0] * w[1]));
+            products.sum()
+        };
+        let size = parameters(&options) as f64 / parameters(&MixtureNetOptions::default()) as f64;
+        let vertices = dims.saturating_sub(3) / 2;
+        (options.most_seen() * vertices) as f64 * size * SECONDS_PER_DECISION
+    }
+}
+
+/// A net as a guide.
+#[derive(Debug)]
+pub(crate) struct NetGuide {
+    kind: Kind,
+    dims: usize,
+    options: MixtureNetOptions,
+    /// What was met in training.
+    facts: Value,
+    place: Place,
+    model: Model,
+    packed: Packed,
+}
+
+impl NetGuide {
+    fn new(
+        kind: Kind,
+        dims: usize,
+        options: MixtureNetOptions,
+        facts: Value,
+        place: Place,
+        model: Model,
+    ) -> Self {
+        let packed = Packed::new(&model, place.clone());
+        Self {
+            kind,
+            dims,
+            options,
+            facts,
+            place,
+            model,
+            packed,
+        }
+    }
+
+    /// Fits a net.
+    pub(crate) fn fit(
+        kind: Kind,
+        given: &Map<String, Value>,
+        records: &Records<'_>,
+        seed: u64,
+        progress: &mut dyn FnMut(f32) -> bool,
+    ) -> Result<Fit, GuideError> {
+        let start = std::time::Instant::now();
+        let options = MixtureNetOptions::parse(kind, given)?;
+        let mut stage = |done: f32| progress(done).then_some(()).ok_or(GuideError::Cancelled);
+        stage(0.0)?;
+        let usable = records.usable(1.0)?;
+        stage(0.02)?;
+        let rows = Weighted::new(records, &usable.rows, &options);
+        let vertices = records.columns(Decision::Direction).count();
+        let positions: Vec<[f32; 3]> = rows
+            .paths
+            .iter()
+            .flat_map(|&row| (0..vertices).map(move |v| records.context(row, v).position))
+            .collect();
+        let place = Place::around(&positions, records.bounces());
+        stage(0.05)?;
+        let data = rows.data(records, &place, vertices);
+        stage(0.08)?;
+        let mut model = Model::random(Head::new(kind, &options), &options, seed);
+        let mut history = Vec::new();
+        if vertices > 0 && !data.weights.is_empty() {
+            let mut share = |done: f32| progress(0.1 + 0.9 * done);
+            history = train::train(kind.name(), &options, &mut model, &data, seed, &mut share)?;
+        }
+        let samples = rows.paths.len();
+        let facts = json!({
+            "paths": records.paths(),
+            "clipped": rows.clipped,
+            "rows": samples,
+            "epochs": history.len(),
+        });
+        progress(1.0).then_some(()).ok_or(GuideError::Cancelled)?;
+        let guide = Self::new(kind, records.dims, options, facts, place, model);
+        Ok(Fit {
+            guide: Box::new(guide),
+            history,
+            seconds: start.elapsed().as_secs_f64(),
+            dropped_nonfinite: usable.nonfinite,
+            outliers_removed: 0,
+            trained_on: usable.rows.len(),
+            samples,
+        })
+    }
+
+    /// Rebuilds a net from a file.
+    pub(crate) fn restore(kind: Kind, contents: Contents) -> Result<Box<dyn Guide>, String> {
+        let mut config = contents.config;
+        let dims = config["dims"]
+            .as_u64()
+            .and_then(|d| usize::try_from(d).ok());
+        let dims = dims.ok_or("its configuration has no `dims`")?;
+        let given = config["options"].take();
+        let given = given
+            .as_object()
+            .ok_or("its configuration has no `options`")?;
+        let options = MixtureNetOptions::parse(kind, given).map_err(|e| e.to_string())?;
+        let head = Head::new(kind, &options);
+        if let Some((name, ..)) = contents.words.first() {
+            return Err(format!("tensor {name:?} belongs to no net"));
+        }
+        let mut values = file::take(contents.tensors, &names(head, &options))?;
+        if values.iter().flatten().any(|x| !x.is_finite()) {
+            return Err("a weight is not a number".to_owned());
+        }
+        let bounds = values.pop().unwrap_or_default();
+        let &[ox, oy, oz, sx, sy, sz] = &bounds[..] else {
+            return Err("tensor \"place\" has the wrong size".to_owned());
+        };
+        let place = Place {
+            origin: [ox, oy, oz],
+            scale: [sx, sy, sz],
+            bounces: dims.saturating_sub(1) / 2,
+        };
+        let mut values = values.into_iter();
+        let net = |widths: Vec<usize>| Mlp {
+            tensors: values.by_ref().take(2 * (widths.len() - 1)).collect(),
+            widths,
+        };
+        let nets = head.widths(&options).into_iter().map(net).collect();
+        let (model, facts) = (Model { head, nets }, config["facts"].take());
+        Ok(Box::new(Self::new(
+            kind, dims, options, facts, place, model,
+        )))
+    }
+}
+
+/// All tensors of a file, the box last.
+fn names(head: Head, options: &MixtureNetOptions) -> Vec<(String, Vec<usize>)> {
+    let widths = head.widths(options).into_iter().enumerate();
+    let nets = widths.flat_map(|(i, w)| Mlp::names(&w, &format!("net.{i}.linear.")));
+    nets.chain([("place".to_owned(), vec![6])]).collect()
+}
+
+impl Guide for NetGuide {
+    fn name(&self) -> &str {
+        self.kind.name()
+    }
+
+    fn models(&self) -> &[Decision] {
+        &[Decision::Direction]
+    }
+
+    fn dims(&self) -> usize {
+        self.dims
+    }
+
+    fn sample(&self, decision: Decision, contexts: &[Context], u: &mut [f32], q: &mut [f32]) {
+        if decision != Decision::Direction {
+            return q.fill(1.0);
+        }
+        let rows = q.len().min(u.len() / 2);
+        self.packed
+            .sample(contexts, &mut u[..2 * rows], &mut q[..rows]);
+    }
+
+    fn density(&self, decision: Decision, contexts: &[Context], u: &[f32], q: &mut [f32]) {
+        if decision != Decision::Direction {
+            return q.fill(1.0);
+        }
+        let rows = q.len().min(u.len() / 2);
+        self.packed
+            .density(contexts, &u[..2 * rows], &mut q[..rows]);
+    }
+
+    fn mass_outside(&self) -> f64 {
+        0.0
+    }
+
+    fn parameters(&self) -> usize {
+        self.model.nets.iter().map(Mlp::parameters).sum()
+    }
+
+    fn describe(&self) -> Value {
+        json!({
+            "name": self.name(),
+            "models": self.models(),
+            "dims": self.dims,
+            "parameters": self.parameters(),
+            "memory": 8 * self.parameters(),
+            "paths": self.facts["paths"],
+            "rows": self.facts["rows"],
+            "epochs": self.facts["epochs"],
+            "clipped": self.facts["clipped"],
+            "options": json_options::to_map(&self.options),
+        })
+    }
+
+    fn contents(&self) -> Option<Contents> {
+        let bounds = self.place.origin.iter().chain(&self.place.scale).copied();
+        let tensors = self.model.nets.iter().flat_map(|net| net.tensors.clone());
+        let tensors = tensors.chain([bounds.collect()]);
+        let names = names(self.model.head, &self.options).into_iter();
+        Some(Contents {
+            guide: self.name().to_owned(),
+            config: json!({
+                "dims": self.dims,
+                "options": json_options::to_map(&self.options),
+                "facts": self.facts,
+            }),
+            tensors: names.zip(tensors).map(|((n, s), v)| (n, s, v)).collect(),
+            ..Contents::default()
+        })
+    }
+}
+
+/// Paths to learn from, and their weights.
+struct Weighted {
+    paths: Vec<usize>,
+    weights: Vec<f32>,
+    clipped: usize,
+}
+
+impl Weighted {
+    /// Weights are estimates of ∫f² that the directions can change, clipped at a quantile and scaled to mean 1.
+    fn new(records: &Records<'_>, usable: &[usize], options: &MixtureNetOptions) -> Self {
+        let stride = usable.len().div_ceil(options.max_rows).max(1);
+        let weight = |row: usize| {
+            let terms = records.terms(row);
+            terms.nee_square() + terms.bsdf_square()
+        };
+        let rows = usable.iter().step_by(stride);
+        let mut rows: Vec<(usize, f64)> = rows.map(|&row| (row, weight(row))).collect();
+        rows.retain(|r| r.1 > 0.0 && r.1.is_finite());
+        let limit = quantile(rows.iter().map(|r| r.1), options.clip_quantile).unwrap_or(1.0);
+        let clipped = rows.iter().filter(|r| r.1 > limit).count();
+        let mean = rows.iter().map(|r| r.1.min(limit)).sum::<f64>() / rows.len().max(1) as f64;
+        Self {
+            weights: rows
+                .iter()
+                .map(|r| (r.1.min(limit) / mean) as f32)
+                .collect(),
+            paths: rows.into_iter().map(|r| r.0).collect(),
+            clipped,
+        }
+    }
+
+    fn data(&self, records: &Records<'_>, place: &Place, vertices: usize) -> Data {
+        let (mut inputs, mut u) = (Vec::new(), Vec::new());
+        for &row in &self.paths {
+            for vertex in 0..vertices {
+                inputs.extend(place.features(&records.context(row, vertex)));
+                let at = row * records.dims + 2 * vertex;
+                u.extend_from_slice(&records.u[at..at + 2]);
+            }
+        }
+        Data {
+            vertices,
+            inputs,
+            u,
+            weights: self.weights.clone(),
+        }
+    }
+}

@@ -1,0 +1,128 @@
+//! Options of the nets.
+
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value};
+
+use super::Kind;
+use crate::{GuideError, options};
+
+/// Rows that training looks at where nothing else is asked for: about a thousand steps.
+const USUAL_ROWS: usize = 1 << 21;
+
+/// Most epochs that are made of few paths.
+const MOST_EPOCHS: usize = 32;
+
+/// Options of `mixture-net`, and of `spline-net` but for the components, in place of which it has `bins`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct MixtureNetOptions {
+    /// Normals of the mixture, 1 … 64. (Default: 6)
+    pub components: usize,
+    /// Units of a hidden layer, 1 … 512. (Default: 32)
+    pub hidden: usize,
+    /// Hidden layers, 1 … 8. (Default: 2)
+    pub layers: usize,
+    /// First step of Adam, in (0, 1]; it falls to 0 as half a cosine. (Default: 5e-3)
+    pub learning_rate: f64,
+    /// Paths per step, 1 … 65,536. (Default: 2048)
+    pub batch: usize,
+    /// Passes over the paths, 1 … 10,000; `null`: as many as show the network 2²¹ paths, at most 32.
+    pub epochs: Option<usize>,
+    /// Paths that are trained with, 2 … 2²⁴; of more, evenly spaced ones are taken. (Default: 524,288)
+    pub max_rows: usize,
+    /// Share a of uniform paths in the mixture whose second moment is the loss, in (0, 1]. (Default: 0.1)
+    pub loss_fraction: f64,
+    /// Paths count at most as much as this quantile of their f²/g, in (0, 1]; 1 clips none. The estimate itself is
+    /// not touched. (Default: 0.999)
+    pub clip_quantile: f64,
+}
+
+impl Default for MixtureNetOptions {
+    fn default() -> Self {
+        Self {
+            components: 6,
+            hidden: 32,
+            layers: 2,
+            learning_rate: 5e-3,
+            batch: 2048,
+            epochs: None,
+            max_rows: 524_288,
+            loss_fraction: 0.1,
+            clip_quantile: 0.999,
+        }
+    }
+}
+
+impl MixtureNetOptions {
+    /// `given` over the defaults, checked.
+    pub(super) fn parse(kind: Kind, given: &Map<String, Value>) -> Result<Self, GuideError> {
+        options::parse(kind.name(), &Self::default(), given)?.checked(kind.name())
+    }
+
+    fn checked(self, guide: &str) -> Result<Self, GuideError> {
+        let map = options::to_map(&self);
+        let rule = |option: &str, accepted: bool, rule: &str| {
+            if accepted {
+                return Ok(());
+            }
+            let value = map.get(option).cloned().unwrap_or(Value::Null);
+            Err(options::bad(guide, option, &value, rule))
+        };
+        let share = |x: f64| x > 0.0 && x <= 1.0;
+        rule(
+            "components",
+            (1..=64).contains(&self.components),
+            "1 to 64 components",
+        )?;
+        rule("hidden", (1..=512).contains(&self.hidden), "1 to 512 units")?;
+        rule(
+            "layers",
+            (1..=8).contains(&self.layers),
+            "1 to 8 hidden layers",
+        )?;
+        rule(
+            "learning_rate",
+            share(self.learning_rate),
+            "a number in (0, 1]",
+        )?;
+        rule(
+            "batch",
+            (1..=65_536).contains(&self.batch),
+            "1 to 65536 paths",
+        )?;
+        rule(
+            "epochs",
+            self.epochs.is_none_or(|e| (1..=10_000).contains(&e)),
+            "1 to 10000 epochs, or null",
+        )?;
+        rule(
+            "max_rows",
+            (2..=1 << 24).contains(&self.max_rows),
+            "2 to 16777216 paths",
+        )?;
+        rule(
+            "loss_fraction",
+            share(self.loss_fraction),
+            "a number in (0, 1]",
+        )?;
+        rule(
+            "clip_quantile",
+            share(self.clip_quantile),
+            "a number in (0, 1]",
+        )?;
+        Ok(self)
+    }
+
+    /// Epochs over so many paths.
+    pub(super) fn epochs(&self, rows: usize) -> usize {
+        let usual = USUAL_ROWS.div_ceil(rows.max(1)).clamp(1, MOST_EPOCHS);
+        self.epochs.unwrap_or(usual)
+    }
+
+    /// Most paths, with repetitions, that a training sees.
+    pub(super) fn most_seen(&self) -> usize {
+        self.epochs.map_or(USUAL_ROWS + self.max_rows, |e| {
+            e.saturating_mul(self.max_rows)
+        })
+    }
+}
