@@ -59,6 +59,8 @@ class Guide:
         self, u: F32, decision: str = "path", contexts: dict[str, NDArray[Any]] | None = None
     ) -> F32:
         """Log-density of rows u (n, d), shape (n,)."""
+    def cells(self, n: int, decision: str, contexts: dict[str, NDArray[Any]]) -> NDArray[np.int64]:
+        """The guide's cell of each place, (n,); -1 where it has none."""
     @property
     def models(self) -> list[str]: ...
     @property

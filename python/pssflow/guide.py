@@ -254,6 +254,20 @@ class Guide:
             raise ValueError(f"`u` has {u.shape[1]} columns; this guide has {self.dims}")
         return self.core.log_prob(u, decision, _places(contexts))
 
+    def cells(
+        self, contexts: Mapping[str, ArrayLike], *, decision: str = "direction"
+    ) -> NDArray[np.int64]:
+        """Which of the guide's cells each place belongs to, (n,): its density is the same throughout a cell.
+
+        Numbers mean nothing but themselves; -1 where the guide has no cell. `contexts` as in `sample`.
+
+        Raises:
+            ValueError: the guide does not model the decision, or the arrays differ in length.
+        """
+        places = _places(contexts) or {}
+        rows = len(next(iter(places.values()), ()))
+        return self.core.cells(rows, decision, places)
+
     @property
     def models(self) -> list[str]:
         """The decisions that it models."""

@@ -90,6 +90,10 @@ impl Guide for Composite {
         }
     }
 
+    fn cell(&self, decision: Decision, context: &Context) -> Option<usize> {
+        self.factor(decision)?.cell(decision, context)
+    }
+
     fn mass_outside(&self) -> f64 {
         self.factors
             .iter()

@@ -27,6 +27,7 @@ mod records;
 mod registry;
 mod select;
 mod table;
+mod vegas;
 
 use std::path::Path;
 
@@ -41,6 +42,7 @@ pub use records::{Emitter, Records};
 pub use registry::{FitFn, GuideSpec, find, fit, registry};
 pub use select::{CandidateReport, Remaining, Selection, candidates, recall, select};
 pub use table::options::{EmitterTableOptions, TableOptions};
+pub use vegas::options::{Condition, VegasOptions};
 
 /// What a number of a path decides; a guide models some of these.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -65,7 +67,7 @@ pub struct Context {
     pub normal: [f32; 3],
     /// Unit direction towards the previous vertex.
     pub outgoing: [f32; 3],
-    /// Film position in [0, 1)².
+    /// Film position in [0, 1)²; of decision [`Decision::Path`] all that is known.
     pub pixel: [f32; 2],
     /// Index of the chosen emitter (decision [`Decision::Light`]).
     pub emitter: u32,
@@ -126,6 +128,12 @@ pub trait Guide: Send + Sync + std::fmt::Debug {
     /// Whether `sample` and `density` want a context a row for a decision that the guide models.
     fn looks_at_contexts(&self, decision: Decision) -> bool {
         decision != Decision::Path
+    }
+
+    /// Which of the guide's own places a context belongs to, for pictures: the density is the same throughout a cell.
+    /// `None` where the guide has no cells, or none there.
+    fn cell(&self, _decision: Decision, _context: &Context) -> Option<usize> {
+        None
     }
 
     /// What a file of the guide holds; `None` for a guide of another make, which keeps its own files.

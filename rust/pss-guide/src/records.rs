@@ -118,6 +118,22 @@ impl Records<'_> {
         self.contexts.get(at).copied().unwrap_or_default()
     }
 
+    /// A path's film position; the corner where none is known.
+    pub(crate) fn pixel(&self, row: usize) -> [f32; 2] {
+        self.pixel.get(row).copied().unwrap_or_default()
+    }
+
+    /// What is known where a decision is taken: of a whole path the film position alone.
+    pub(crate) fn known(&self, decision: Decision, row: usize, vertex: usize) -> Context {
+        if decision == Decision::Path {
+            return Context {
+                pixel: self.pixel(row),
+                ..Context::default()
+            };
+        }
+        self.context(row, vertex)
+    }
+
     /// Whether all that a row holds is finite, its densities positive and its numbers in the cube.
     pub(crate) fn is_sound(&self, row: usize) -> bool {
         self.f[row].is_finite()
@@ -178,7 +194,7 @@ impl Records<'_> {
                     u.extend_from_slice(&self.u[row * self.dims..][columns.clone()]);
                 }
                 if guide.looks_at_contexts(decision) {
-                    contexts.extend(rows.clone().map(|row| self.context(row, vertex)));
+                    contexts.extend(rows.clone().map(|row| self.known(decision, row, vertex)));
                 }
                 each.clear();
                 each.resize(rows.len(), 1.0);

@@ -6,6 +6,7 @@ use crate::file::Contents;
 use crate::flow::{Domain, RealNvp, options::RealNvpOptions};
 use crate::net::{Kind as Net, NetGuide};
 use crate::table::{Kind, TableGuide};
+use crate::vegas::{Vegas, options::VegasOptions};
 use crate::{Decision, Fit, Guide, GuideError, Recipe, Records, options};
 
 /// Signature of [`GuideSpec::fit`]: options, data, seed, progress.
@@ -81,6 +82,19 @@ static REGISTRY: [GuideSpec; 6] = [
         refine: false,
         fit: |o, r, s, p| RealNvp::fit(Domain::Logit, o, r, s, p),
         restore: |c| RealNvp::restore(Domain::Logit, c),
+    },
+    GuideSpec {
+        name: crate::vegas::NAME,
+        summary: "each number by itself: Lepage's VEGAS, a histogram a number for each tile of the image",
+        models: &[Decision::Path],
+        defaults: || options::to_map(&VegasOptions::default()),
+        validate: |o| VegasOptions::parse(o).map(drop),
+        seconds_per_path: |_, _| 0.0,
+        uniform_fraction: 0.1,
+        cost_ratio: 0.5,
+        refine: true,
+        fit: |o, r, _, p| Vegas::fit(o, r, p),
+        restore: Vegas::restore,
     },
     GuideSpec {
         name: Kind::Direction.name(),

@@ -348,7 +348,9 @@ fn cost_ratio(fixed: f64, guide: &dyn Guide, records: &Records<'_>, remaining: &
                 })
                 .collect();
             let contexts: Vec<Context> = if guide.looks_at_contexts(decision) {
-                (0..rows).map(|row| records.context(row, vertex)).collect()
+                (0..rows)
+                    .map(|row| records.known(decision, row, vertex))
+                    .collect()
             } else {
                 Vec::new()
             };

@@ -203,6 +203,23 @@ impl Guide {
         Ok(arrays::to_vector(py, log_q))
     }
 
+    /// The cell of each of `n` places of a decision; −1 where the guide has none.
+    fn cells(
+        &self,
+        py: Python<'_>,
+        n: usize,
+        decision: &str,
+        contexts: Bound<'_, PyDict>,
+    ) -> PyResult<Py<PyAny>> {
+        let (decision, _) = self.asked(decision)?;
+        let contexts = contexts::contexts(&contexts, n)?;
+        let cell = |c| self.inner.cell(decision, c);
+        let cells = contexts
+            .iter()
+            .map(|c| cell(c).and_then(|i| i64::try_from(i).ok()).unwrap_or(-1));
+        Ok(arrays::to_vector(py, cells.collect::<Vec<i64>>()))
+    }
+
     /// The decisions that it models.
     #[getter]
     fn models(&self) -> Vec<String> {

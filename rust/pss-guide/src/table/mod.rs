@@ -358,6 +358,19 @@ impl Guide for TableGuide {
         }
     }
 
+    fn cell(&self, decision: Decision, context: &Context) -> Option<usize> {
+        match &self.tables {
+            _ if !self.models().contains(&decision) => None,
+            Tables::Direction(bank) => bank.find(context.bounce, context),
+            Tables::Emitter(bank) => bank.find(0, context),
+            Tables::Light {
+                area,
+                environment,
+                surrounds,
+            } => side(area, environment, surrounds, context.emitter).find(context.emitter, context),
+        }
+    }
+
     fn mass_outside(&self) -> f64 {
         0.0
     }
