@@ -144,6 +144,7 @@ class Scene:
         {"guide": "none" | name of the registry | "ready" (the fitted `guide`) | "foreign" (the object `guide`),
          "guide_options": {...}, "k": 2, "parametrisation": "bsdf|cosine|uniform",
          "emitter_strategy": "mis|nee", "spp": N or null, "time": seconds or null,
+         "snapshots": [shorter times],
          "replay": [{"kind": "pilot|guided|uniform", "spp": n, "record": share}, ...] or null,
          "uniform_fraction": a or null, "pilot_spp": n or null, "keep_pilot": true, "seed": 0, "threads": 0}
 
@@ -152,8 +153,9 @@ class Scene:
         {"chosen", "a", "k", "parametrisation", "emitter_strategy", "seed", "threads", "camera_rays", "paths_found",
          "nonzero", "nonzero_share", "outside", "non_finite", "pilot": {same counts}, "mean": [r,g,b],
          "variance": relMSE's formula with the own variance of the mean, "max_weight", "max_contribution", "ess",
-         "passes": [{"kind","spp","record"}], "notes": [str], "training": {...}, "seconds": {"pilot","fit","render"}},
-        and "guide": Guide | None.
+         "passes": [{"kind","spp","record"}], "notes": [str], "training": {...}, "seconds": {"pilot","fit","render"},
+         "elapsed": seconds of all phases and between them},
+        "guide": Guide | None, and "snapshots": a list of the same, each with the "time" that was asked for.
         """
     # For parity tests: values of single plugins.
     def ray_intersect(self, origins: F32, directions: F32) -> dict[str, NDArray[Any]]:

@@ -90,6 +90,7 @@ class Plan:
     seed: int
     threads: int
     replay: list[dict[str, Any]] | None
+    snapshots: tuple[float, ...] = ()
 
     @classmethod
     def make(
@@ -110,6 +111,7 @@ class Plan:
         threads: int | None = None,
         preset: str | None = None,
         replay: Sequence[Mapping[str, Any]] | None = None,
+        snapshots: Sequence[float] = (),
     ) -> Plan:
         """Checks the arguments of a render and fills in defaults.
 
@@ -166,6 +168,7 @@ class Plan:
             seed=check_integer("seed", seed, 0, 2**64 - 1),
             threads=check_threads(threads),
             replay=passes,
+            snapshots=check_snapshots(snapshots, time),
         )
 
     def core(self, guide: str, guide_options: Mapping[str, Any], strategy: str) -> str:
@@ -179,6 +182,7 @@ class Plan:
                 "emitter_strategy": strategy,
                 "spp": self.spp,
                 "time": self.time,
+                "snapshots": self.snapshots,
                 "replay": self.replay,
                 "uniform_fraction": self.uniform_fraction,
                 "pilot_spp": self.pilot_spp,
@@ -190,8 +194,11 @@ class Plan:
             allow_nan=False,
         )
 
-    def budget(self, *, learns: bool) -> str:
-        """The budget in words, as tables and titles show it."""
+    def budget(self, *, learns: bool, snapshot: float | None = None) -> str:
+        """The budget in words, as tables and titles show it; of the whole render, or of a snapshot."""
+        if snapshot is not None:
+            inside = " incl. pilot and training" if learns else ""
+            return f"first {snapshot:g} of {self.time:g} s{inside}"
         if self.time is not None:
             return f"{self.time:g} s" + (" incl. pilot and training" if learns else "")
         if self.replay is not None:
@@ -250,6 +257,27 @@ def check_number(
 def check_threads(threads: int | None) -> int:
     """Threads for the core: 0 stands for all cores."""
     return 0 if threads is None else check_integer("threads", threads, 1, MOST_THREADS)
+
+
+def check_snapshots(snapshots: Sequence[float], time: float | None) -> tuple[float, ...]:
+    """Times of snapshots in seconds: increasing, and below the time of the render."""
+    if isinstance(snapshots, (str, bytes)) or not isinstance(snapshots, Sequence):
+        raise ValueError(f"`snapshots` = {snapshots!r}: expected a list of seconds, as (1, 3, 10)")
+    if not snapshots:
+        return ()
+    if time is None:
+        raise ValueError(
+            f"`snapshots` = {tuple(snapshots)} were given without a `time`: a render by samples has none"
+        )
+    checked = tuple(
+        check_number(f"snapshots[{i}]", value, 0.0, 1e9, above=True, unit=" (seconds)")
+        for i, value in enumerate(snapshots)
+    )
+    if any(later <= earlier for earlier, later in zip(checked, (*checked[1:], time), strict=True)):
+        raise ValueError(
+            f"`snapshots` = {checked}: expected times that increase and are below {time:g} s"
+        )
+    return checked
 
 
 def check_passes(replay: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:

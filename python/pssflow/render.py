@@ -47,6 +47,8 @@ class Result:
     """Seconds: `load`, `export`, `bvh`, `pilot`, `fit`, `render`."""
     guide: Guide | ForeignGuide | None
     """The guide that drew the paths; None for random numbers."""
+    snapshots: tuple[Result, ...] = ()
+    """What there was after each of the times `snapshots`, in the same form: each `stats` can be replayed."""
 
     @property
     def notes(self) -> list[str]:
@@ -93,6 +95,7 @@ def render(
     keep_pilot: bool | None = None,
     combine: str | None = None,
     replay: Replay | None = None,
+    snapshots: Sequence[float] = (),
     **guide_options: Any,
 ) -> Result:
     """Renders the light that reaches the eye after exactly k reflections: pilot → fit → render.
@@ -126,6 +129,9 @@ def render(
             by its variance, estimated crosswise from halves of the image: less noise, a bias of the order of 1 ÷ spp).
         replay: the record of an earlier run (`Result.stats` or the command's JSON file), whose guide, settings, seed
             and passes are repeated, or only its `passes`.
+        snapshots: shorter times, increasing, at which the image so far is handed out (`Result.snapshots`): the last one
+            that was complete by then, or the first one there was. Passes are cut so that one ends shortly before;
+            `stats["elapsed"]` tells the seconds really used. What handing out takes is not charged to `time`.
         **guide_options: the guide's own, as `epochs=7`; in a composite also `**{"realnvp.epochs": 7}`.
 
     Returns:
@@ -168,6 +174,7 @@ def render(
         threads=threads,
         preset=preset,
         replay=replay,
+        snapshots=snapshots,
         **settings,
     )
     if not isinstance(scene, Scene):
@@ -199,31 +206,35 @@ def run(scene: Scene, choice: Choice, plan: Plan, progress: Progress = True) -> 
             given.core if isinstance(given, Guide) else given,
             listener,
         )
-    record: dict[str, Any] = json.loads(output["record"])
-    fitted = output["guide"]
-    used: Guide | ForeignGuide | None = None
-    if record["chosen"] != "none":
-        used = given
-        if used is None and fitted is not None:
-            used = Guide(fitted, columns_hash=hashes[0], scene_hash=hashes[1])
-    timings = {**scene.timings, **record["seconds"]}
     notes = [*scene.notes, *([f"emitter_strategy auto: {strategy}, {why}"] if why else [])]
-    stats = {
-        "scene": scene.name,
-        "guide": choice.label,
-        **record,
-        "relmse": None,
-        "relmse_trimmed": None,
-        "notes": notes + record["notes"],
-        "seconds": {**timings, "total": sum(timings.values())},
-        "budget": plan.budget(learns=choice.learns),
-        "guide_options": choice.options,
-        "keep_pilot": plan.keep_pilot,
-        "version": _core.__version__,
-        "variant": scene.variant,
-    }
-    images = {key: output[key] for key in ("image", "variance", "found", "nonzero")}
-    return Result(**images, stats=stats, timings=timings, guide=used)
+
+    def result(output: Mapping[str, Any], snapshots: tuple[Result, ...] = ()) -> Result:
+        record: dict[str, Any] = json.loads(output["record"])
+        fitted = output["guide"]
+        used: Guide | ForeignGuide | None = None
+        if record["chosen"] != "none":
+            used = given
+            if used is None and fitted is not None:
+                used = Guide(fitted, columns_hash=hashes[0], scene_hash=hashes[1])
+        timings = {**scene.timings, **record["seconds"]}
+        stats = {
+            "scene": scene.name,
+            "guide": choice.label,
+            **record,
+            "relmse": None,
+            "relmse_trimmed": None,
+            "notes": notes + record["notes"],
+            "seconds": {**timings, "total": sum(timings.values())},
+            "budget": plan.budget(learns=choice.learns, snapshot=output.get("time")),
+            "guide_options": choice.options,
+            "keep_pilot": plan.keep_pilot,
+            "version": _core.__version__,
+            "variant": scene.variant,
+        }
+        images = {key: output[key] for key in ("image", "variance", "found", "nonzero")}
+        return Result(**images, stats=stats, timings=timings, guide=used, snapshots=snapshots)
+
+    return result(output, tuple(result(part) for part in output["snapshots"]))
 
 
 def _replayed(

@@ -7,6 +7,7 @@ mod contexts;
 mod errors;
 mod foreign;
 mod guide;
+mod outcome;
 mod output;
 mod parity;
 mod scene;

@@ -7,7 +7,7 @@ use std::sync::{Arc, OnceLock};
 use numpy::PyReadonlyArray2;
 use pss_render::math::Rgb;
 use pss_render::{Columns, EmitterStrategy, Parametrisation, Paths, Tracer};
-use pssflow::{Auto, Budget, Combine, GuideChoice, Named, Options, Outcome, PassPlan};
+use pssflow::{Auto, Budget, Combine, GuideChoice, Named, Options, PassPlan};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use serde::Deserialize;
@@ -16,7 +16,7 @@ use serde_json::{Map, Value, json};
 use crate::foreign::{ForeignGuide, Guarded};
 use crate::guide::Guide;
 use crate::watch::watched;
-use crate::{arrays, errors};
+use crate::{arrays, errors, outcome};
 
 /// A scene that can be traced.
 #[pyclass(module = "pssflow._core", frozen)]
@@ -48,6 +48,8 @@ struct Request {
     emitter_strategy: String,
     spp: Option<u32>,
     time: Option<f64>,
+    #[serde(default)]
+    snapshots: Vec<f64>,
     replay: Option<Vec<PassPlan>>,
     uniform_fraction: Option<f32>,
     pilot_spp: Option<u32>,
@@ -264,30 +266,8 @@ impl Scene {
             return Err(error);
         }
         let outcome = outcome.map_err(errors::render)?;
-
-        let shape = [outcome.height as usize, outcome.width as usize, 3];
-        let dict = PyDict::new(py);
-        dict.set_item("record", record(&outcome, &options).to_string())?;
-        let guide = match (&outcome.guide, &foreign, guide) {
-            (Some(_), Some(_), Some(object)) => Some(object.unbind()),
-            (Some(inner), _, _) => Some(
-                Py::new(
-                    py,
-                    Guide {
-                        inner: Arc::clone(inner),
-                    },
-                )?
-                .into_any(),
-            ),
-            (None, _, _) => None,
-        };
-        dict.set_item("guide", guide)?;
-        let film = outcome.film;
-        dict.set_item("image", arrays::to_cube(py, film.image, shape)?)?;
-        dict.set_item("variance", arrays::to_cube(py, film.variance, shape)?)?;
-        dict.set_item("found", arrays::to_counts(py, film.found, shape[1])?)?;
-        dict.set_item("nonzero", arrays::to_counts(py, film.nonzero, shape[1])?)?;
-        Ok(dict)
+        let object = foreign.and(guide);
+        outcome::to_dict(py, outcome, &options, object.as_ref())
     }
 
     /// Times the Embree queries of a render alone.
@@ -399,6 +379,7 @@ impl Scene {
             parametrisation: parametrisation(&request.parametrisation)?,
             strategy: strategy(&request.emitter_strategy)?,
             budget,
+            snapshots: request.snapshots.clone(),
             uniform_fraction: request.uniform_fraction,
             pilot_spp: request.pilot_spp,
             keep_pilot: request.keep_pilot,
@@ -408,39 +389,6 @@ impl Scene {
             max_records: defaults.max_records,
         })
     }
-}
-
-/// The record of a render: what was counted, chosen and timed.
-fn record(outcome: &Outcome, options: &Options) -> Value {
-    let mut record = json!(outcome.rendered.counts);
-    let mut pilot = json!(outcome.pilot.counts);
-    pilot["nonzero_share"] = json!(outcome.pilot.counts.nonzero_share());
-    let summary = json!({
-        "chosen": outcome.chosen,
-        "a": outcome.uniform_fraction,
-        "k": options.k,
-        "parametrisation": options.parametrisation.name(),
-        "emitter_strategy": options.strategy.name(),
-        "seed": options.seed,
-        "threads": outcome.threads,
-        "nonzero_share": outcome.rendered.counts.nonzero_share(),
-        "pilot": pilot,
-        "mean": outcome.mean(),
-        "variance": outcome.relative_variance(),
-        "max_weight": outcome.in_image.max_weight,
-        "max_contribution": outcome.in_image.max_contribution(),
-        "ess": outcome.in_image.ess(),
-        "passes": outcome.passes,
-        "combine": options.combine.name(),
-        "candidates": outcome.candidates,
-        "notes": outcome.notes,
-        "training": outcome.training,
-        "seconds": outcome.seconds,
-    });
-    if let (Some(record), Value::Object(summary)) = (record.as_object_mut(), summary) {
-        record.extend(summary);
-    }
-    record
 }
 
 /// Film positions, and the lens' numbers where each row has four.

@@ -15,6 +15,7 @@ use crate::options::{Budget, Combine, Options, PassKind, PassPlan};
 use crate::pass::{Pass, PassContext};
 use crate::progress::{Phase, Progress};
 use crate::records::PathRecords;
+use crate::snapshots::{Snapshot, Snapshots};
 use crate::statistics::Statistics;
 
 /// Wall time by phase.
@@ -29,7 +30,7 @@ pub struct Seconds {
 }
 
 /// A rendered image and how it came about.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub struct Outcome {
     /// Columns.
     pub width: u32,
@@ -57,10 +58,14 @@ pub struct Outcome {
     pub rendered: Statistics,
     /// All paths in the image: the rendered ones, and the pilot's where it was kept.
     pub in_image: Statistics,
-    /// Wall time.
+    /// Wall time by phase.
     pub seconds: Seconds,
+    /// Wall time of all phases and what lies between them, without what snapshots took.
+    pub elapsed: f64,
     /// Threads that rendered.
     pub threads: usize,
+    /// The image so far at the times that were asked for.
+    pub snapshots: Vec<Snapshot>,
 }
 
 impl Outcome {
@@ -131,7 +136,7 @@ pub fn render(
         pilot: Statistics::default(),
         rendered: Statistics::default(),
         seconds: Seconds::default(),
-        notes: Vec::new(),
+        snapshots: Snapshots::at(&options.snapshots),
     };
     run.take_ready()?;
     match &options.budget {
@@ -157,6 +162,7 @@ pub(crate) fn thread_pool(threads: usize) -> Result<rayon::ThreadPool, RenderErr
 pub(crate) struct Run<'a> {
     pub(crate) context: PassContext<'a>,
     pub(crate) options: &'a Options,
+    /// When it began; put forward by what snapshots took.
     pub(crate) clock: Instant,
     /// Sums of the passes; with weights by variance, of none.
     image: Accumulator,
@@ -173,7 +179,7 @@ pub(crate) struct Run<'a> {
     pub(crate) pilot: Statistics,
     rendered: Statistics,
     pub(crate) seconds: Seconds,
-    notes: Vec<String>,
+    pub(crate) snapshots: Snapshots,
 }
 
 impl Run<'_> {
@@ -249,35 +255,66 @@ impl Run<'_> {
             let name = self.current.name.clone();
             self.drawn = Some((guide, name, mixture.uniform_fraction));
         }
+        self.note_image();
         Ok(())
     }
 
     fn finish(mut self) -> Outcome {
+        self.note_end();
+        let elapsed = self.clock.elapsed().as_secs_f64();
+        let mut outcome = self.outcome(self.develop(self.apart.len()), elapsed);
+        outcome.snapshots = self.snapshots.taken;
+        outcome
+    }
+
+    /// Whether any path is in the image yet.
+    pub(crate) fn has_image(&self) -> bool {
+        self.in_image().counts.camera_rays > 0
+    }
+
+    /// Passes in the image, where these are kept apart.
+    pub(crate) fn passes_apart(&self) -> usize {
+        self.apart.len()
+    }
+
+    /// The image of all passes, or of the first `apart` ones where these are weighted by variance.
+    pub(crate) fn develop(&self, apart: usize) -> Developed {
+        match self.options.combine {
+            Combine::Samples => self.image.develop(),
+            Combine::Variance => {
+                by_variance(self.context.tracer.scene().film(), &self.apart[..apart])
+            }
+        }
+    }
+
+    fn in_image(&self) -> Statistics {
+        let mut all = self.rendered;
+        if self.options.keep_pilot {
+            all.add(&self.pilot);
+        }
+        all
+    }
+
+    /// What there was after `elapsed` seconds, now, with its image.
+    pub(crate) fn outcome(&self, film: Developed, elapsed: f64) -> Outcome {
         let scene = self.context.tracer.scene();
-        match (
-            &self.drawn,
-            &self.current.guide,
-            self.current.refusal.take(),
-        ) {
-            (None, _, Some(refusal)) => self.notes.push(refusal),
+        let mut notes = Vec::new();
+        match (&self.drawn, &self.current.guide, &self.current.refusal) {
+            (None, _, Some(refusal)) => notes.push(refusal.clone()),
             // A guide that was learned just as the time ran out drew nothing, and is not what was rendered with.
             (None, Some(unused), None) => {
                 let name = unused.name();
-                self.notes.push(format!(
+                notes.push(format!(
                     "{name}: the time was out after training; none is used"
                 ));
             }
             _ => {}
         }
         let [width, height] = scene.film().crop_size();
-        let film = match self.options.combine {
-            Combine::Samples => self.image.develop(),
-            Combine::Variance => by_variance(scene.film(), &self.apart),
-        };
         let mut all = self.pilot;
         all.add(&self.rendered);
         if all.counts.non_finite > 0 {
-            self.notes.push(format!(
+            notes.push(format!(
                 "{} paths were not finite and count as zero",
                 all.counts.non_finite
             ));
@@ -290,10 +327,10 @@ impl Run<'_> {
             } else {
                 "no path carried light"
             };
-            self.notes.push(format!("the image is black: {why}"));
+            notes.push(format!("the image is black: {why}"));
         }
-        let (guide, chosen, uniform_fraction) = match self.drawn {
-            Some((guide, name, a)) => (Some(guide), name, a),
+        let (guide, chosen, uniform_fraction) = match &self.drawn {
+            Some((guide, name, a)) => (Some(Arc::clone(guide)), name.clone(), *a),
             None => (None, "none".to_owned(), 1.0),
         };
         Outcome {
@@ -303,19 +340,17 @@ impl Run<'_> {
             guide,
             chosen,
             uniform_fraction,
-            candidates: self.current.candidates,
-            notes: self.notes,
-            training: self.current.training,
-            passes: self.passes,
+            candidates: self.current.candidates.clone(),
+            notes,
+            training: self.current.training.clone(),
+            passes: self.passes.clone(),
             pilot: self.pilot,
             rendered: self.rendered,
-            in_image: if self.options.keep_pilot {
-                all
-            } else {
-                self.rendered
-            },
+            in_image: self.in_image(),
             seconds: self.seconds,
+            elapsed,
             threads: self.context.pool.current_num_threads(),
+            snapshots: Vec::new(),
         }
     }
 }

@@ -90,6 +90,8 @@ pub struct Options {
     pub strategy: EmitterStrategy,
     /// How long to render.
     pub budget: Budget,
+    /// Shorter times of a [`Budget::Time`], increasing, at which the image so far is handed out.
+    pub snapshots: Vec<f64>,
     /// Share of uniform paths in the mixture, in [0, 1]; `None`: the guide's own, or what a chooser found best.
     pub uniform_fraction: Option<f32>,
     /// Samples per pixel of the pilot; `None`: an eighth of `Spp` or a tenth of `Time` for a guide that is refined from
@@ -115,6 +117,7 @@ impl Default for Options {
             parametrisation: Parametrisation::default(),
             strategy: EmitterStrategy::default(),
             budget: Budget::Spp(16),
+            snapshots: Vec::new(),
             uniform_fraction: None,
             pilot_spp: None,
             keep_pilot: true,
@@ -145,6 +148,7 @@ impl Options {
             Budget::Replay(passes) => self.check_replay(passes)?,
             _ => {}
         }
+        self.check_snapshots()?;
         let pilot = self.pilot_spp.unwrap_or(1);
         if self.guide.learns() && !(1..=Self::MOST_SPP).contains(&pilot) {
             return error(
@@ -163,6 +167,27 @@ impl Options {
             );
         }
         Ok(())
+    }
+
+    fn check_snapshots(&self) -> Result<(), RenderError> {
+        let Some(last) = self.snapshots.last() else {
+            return Ok(());
+        };
+        let rule = match self.budget {
+            Budget::Time(time) => {
+                let increase = self.snapshots.windows(2).all(|pair| pair[0] < pair[1]);
+                if increase && self.snapshots[0] > 0.0 && *last < time {
+                    return Ok(());
+                }
+                "positive, increasing and below time"
+            }
+            _ => "left out without a time",
+        };
+        Err(RenderError::Option {
+            name: "snapshots",
+            value: format!("{:?}", self.snapshots),
+            rule,
+        })
     }
 
     fn check_replay(&self, passes: &[PassPlan]) -> Result<(), RenderError> {
@@ -268,6 +293,28 @@ mod tests {
         assert!(message.starts_with("spp = 4: must be more"), "{message}");
         let message = refusal(GuideChoice::None, Budget::Spp(u32::MAX), None);
         assert!(message.starts_with("spp = 4294967295"), "{message}");
+    }
+
+    #[test]
+    fn snapshots_that_cannot_be_taken_are_refused() {
+        for (budget, snapshots, rule) in [
+            (Budget::Spp(4), vec![1.0], "left out without a time"),
+            (Budget::Time(2.0), vec![1.0, 1.0], "increasing"),
+            (Budget::Time(2.0), vec![0.0], "positive"),
+            (Budget::Time(2.0), vec![1.0, 2.0], "below time"),
+            (Budget::Time(2.0), vec![f64::NAN], "positive"),
+        ] {
+            let options = Options {
+                budget,
+                snapshots,
+                ..Options::default()
+            };
+            let message = options.check().unwrap_err().to_string();
+            assert!(
+                message.starts_with("snapshots = [") && message.contains(rule),
+                "{message}"
+            );
+        }
     }
 
     #[test]

@@ -1,7 +1,5 @@
 //! Which passes a budget is cut into.
 
-use std::time::Instant;
-
 use crate::choice::{GuideChoice, Left};
 use crate::error::RenderError;
 use crate::estimator::Run;
@@ -17,6 +15,10 @@ const PILOT_DIVISOR: [u32; 2] = [4, 8];
 const TRAINING_TIME: f64 = 0.3;
 /// Samples per pixel that a timed pilot's memory for records is planned for.
 const TIMED_PILOT_SPP: u32 = 64;
+
+/// Share of the time before a snapshot that a pass is planned to take: one that takes a quarter longer still is in time.
+/// The next pass uses the rest.
+const BEFORE_SNAPSHOT: f64 = 0.8;
 
 impl Run<'_> {
     /// Passes that follow from the number of samples alone: a pilot, then, while there is something to learn, as many
@@ -84,6 +86,7 @@ impl Run<'_> {
         let refines = self.options.guide.refines();
         let begin = self.clock.elapsed().as_secs_f64();
         let (mut spp, mut each): (u32, Option<f64>) = (1, None);
+        let mut largest = spp;
         loop {
             let now = self.clock.elapsed().as_secs_f64();
             if now >= time && !self.passes.is_empty() && (self.options.keep_pilot || each.is_some())
@@ -99,9 +102,9 @@ impl Run<'_> {
                 break;
             }
             if let Some(each) = each {
-                let left = ((time - now) / each).clamp(0.0, f64::from(1 << 20)) as u32;
-                spp = (2 * spp)
-                    .min(left)
+                // What a snapshot cut short does not slow the doubling down.
+                spp = (2 * largest)
+                    .min(self.affordable(each, time))
                     .min(Options::MOST_SPP.saturating_sub(self.next_sample));
                 if spp == 0 {
                     break;
@@ -117,11 +120,28 @@ impl Run<'_> {
             } else {
                 0.0
             };
-            let start = Instant::now();
+            // By the render's own clock, which snapshots do not run down.
+            let start = self.clock.elapsed().as_secs_f64();
             self.pass(self.kind(), spp, record, span)?;
-            each = Some(start.elapsed().as_secs_f64() / f64::from(spp));
+            each = Some((self.clock.elapsed().as_secs_f64() - start) / f64::from(spp));
+            largest = largest.max(spp);
         }
         Ok(())
+    }
+
+    /// Samples per pixel that are done, at `each` seconds, before the next snapshot, or before the first one that leaves
+    /// time for any, or before the end.
+    fn affordable(&self, each: f64, end: f64) -> u32 {
+        let now = self.clock.elapsed().as_secs_f64();
+        let fit = |until: f64| ((until - now) / each).clamp(0.0, f64::from(1 << 20));
+        let before = |snapshot: f64| match fit(snapshot) {
+            one if one < 2.0 => one as u32,
+            many => (many * BEFORE_SNAPSHOT) as u32,
+        };
+        let mut snapshots = self.snapshots.pending().map(before);
+        snapshots
+            .find(|spp| *spp > 0)
+            .unwrap_or_else(|| fit(end) as u32)
     }
 
     /// One sample a pixel, then as many more as its measured speed allows (or as were asked for), of which no
@@ -133,14 +153,14 @@ impl Run<'_> {
             _ => 0.0,
         };
         let refines = self.options.guide.refines();
-        let start = Instant::now();
+        let start = self.clock.elapsed().as_secs_f64();
         let pixels = self.context.tracer.scene().film().pixels() as f64;
         let affordable = time * TRAINING_TIME / seconds_per_path.max(f64::MIN_POSITIVE);
         // How many paths carry light is not known yet; a quarter of all is on the high side.
         let first = (4.0 * affordable / pixels).min(1.0) as f32;
         let first = first.min(self.record_share(TIMED_PILOT_SPP, false));
         self.pass(PassKind::Pilot, 1, first, (0.0, 0.1))?;
-        let each = start.elapsed().as_secs_f64();
+        let each = self.clock.elapsed().as_secs_f64() - start;
         let share = PILOT_TIME[usize::from(refines)];
         let more = match self.options.pilot_spp {
             Some(spp) => spp - 1,
@@ -153,7 +173,15 @@ impl Run<'_> {
         let left = (affordable - self.records.len() as f64).max(0.0);
         let record = (left / nonzero.max(1.0)).min(1.0) as f32;
         let record = record.min(self.record_share(more.max(TIMED_PILOT_SPP), refines));
-        self.pass(PassKind::Pilot, more, record, (0.1, 1.0))
+        let mut left = more;
+        while left > 0 {
+            let spp = self.affordable(each, f64::INFINITY).clamp(1, left);
+            let done = |left: u32| 1.0 - 0.9 * left as f32 / more as f32;
+            let span = (done(left), done(left - spp));
+            self.pass(PassKind::Pilot, spp, record, span)?;
+            left -= spp;
+        }
+        Ok(())
     }
 
     /// Share of the light-carrying paths to keep so that a pass of `spp` fits the memory that is left for records, or

@@ -6,9 +6,11 @@ mod common;
 use std::path::Path;
 use std::sync::Arc;
 
-use pss_guide::{Context, Decision, Guide, GuideError, Header};
+use pss_guide::{Context, Decision, Guide, GuideError, Header, Recipe};
 use pssflow::pss_render::Scene;
-use pssflow::{Budget, GuideChoice, Options, Outcome, PassKind, PassPlan, Silent, render};
+use pssflow::{
+    Budget, Combine, GuideChoice, Named, Options, Outcome, PassKind, PassPlan, Silent, render,
+};
 use serde_json::Value;
 
 use common::furnace;
@@ -125,4 +127,57 @@ fn a_path_that_is_not_finite_carries_no_light_in_any_count() {
     assert_eq!(outcome.film.nonzero, [0]);
     assert_eq!(outcome.rendered.max_weight, 0.0);
     assert_eq!(outcome.film.image, [0.0; 3]);
+}
+
+#[test]
+fn a_snapshot_is_the_last_image_of_its_time_and_its_passes_replay_it() {
+    let scene = furnace(16);
+    for (combine, keep_pilot) in [
+        (Combine::Samples, true),
+        (Combine::Variance, true),
+        (Combine::Samples, false),
+    ] {
+        let mut options = Options {
+            guide: GuideChoice::Learn(Arc::new(Named::new(
+                Recipe::parse("direction-table", &serde_json::Map::new()).unwrap(),
+            ))),
+            budget: Budget::Time(0.4),
+            snapshots: vec![1e-9, 0.05, 0.2],
+            combine,
+            keep_pilot,
+            threads: 2,
+            ..Options::default()
+        };
+        let whole = render(&scene, &options, &Silent).unwrap();
+        let times: Vec<f64> = whole.snapshots.iter().map(|s| s.time).collect();
+        assert_eq!(times, options.snapshots);
+        let mut before = 0;
+        options.snapshots.clear();
+        for snapshot in &whole.snapshots {
+            let (n, told) = (snapshot.outcome.passes.len(), &snapshot.outcome);
+            assert_eq!(told.passes[..], whole.passes[..n]);
+            assert!(n >= before.max(1) && told.elapsed <= whole.elapsed);
+            // Late only where there was no image before.
+            let images = told
+                .passes
+                .iter()
+                .filter(|p| keep_pilot || p.kind != PassKind::Pilot);
+            assert!(told.elapsed <= snapshot.time || images.count() == 1);
+            let phases = told.seconds.pilot + told.seconds.fit + told.seconds.render;
+            assert!(phases <= told.elapsed * (1.0 + 1e-9));
+            let spp: u32 = told.passes.iter().map(|p| p.spp).sum();
+            let paths = told.pilot.counts.camera_rays + told.rendered.counts.camera_rays;
+            assert_eq!(paths, 256 * u64::from(spp));
+            options.budget = Budget::Replay(told.passes.clone());
+            let again = render(&scene, &options, &Silent).unwrap();
+            assert_eq!(again.film.image, told.film.image);
+            assert_eq!(again.film.variance, told.film.variance);
+            assert_eq!(again.film.nonzero, told.film.nonzero);
+            assert!(again.snapshots.is_empty());
+            before = n;
+        }
+        options.budget = Budget::Replay(whole.passes.clone());
+        let again = render(&scene, &options, &Silent).unwrap();
+        assert_eq!(again.film.image, whole.film.image);
+    }
 }
