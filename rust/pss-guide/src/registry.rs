@@ -50,7 +50,7 @@ pub struct GuideSpec {
     pub(crate) restore: fn(Contents) -> Result<Box<dyn Guide>, String>,
 }
 
-static REGISTRY: [GuideSpec; 6] = [
+static REGISTRY: &[GuideSpec] = &[
     GuideSpec {
         name: "realnvp",
         summary: "the thesis: RealNVP over all numbers at once, normal prior, samples outside the cube are lost",
@@ -90,6 +90,7 @@ static REGISTRY: [GuideSpec; 6] = [
         defaults: || options::to_map(&VegasOptions::default()),
         validate: |o| VegasOptions::parse(o).map(drop),
         seconds_per_path: |_, _| 0.0,
+        seconds: |_, _| 0.0,
         uniform_fraction: 0.1,
         cost_ratio: 0.5,
         refine: true,
@@ -156,7 +157,7 @@ static REGISTRY: [GuideSpec; 6] = [
 
 /// All guides that can be fitted. `none`, the uniform density, needs no fit and is the caller's.
 pub fn registry() -> &'static [GuideSpec] {
-    &REGISTRY
+    REGISTRY
 }
 
 /// The registry line of `name`.
