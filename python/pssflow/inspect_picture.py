@@ -90,7 +90,7 @@ def draw_maps(found: ImageMaps, path: str | Path) -> None:
     most = float(np.nanquantile(error, 0.98)) if np.isfinite(error).any() else 1.0
     _map(figure, axes[0][2], error, "none: standard error ÷ mean", "ratio", "inferno", 0, most)
     for row, line in zip(found.rows, axes[1:], strict=True):
-        # Blue where it pays, orange where it costs: as far on either side.
+        # Purple where it pays, orange where it costs: as far on either side.
         logs = np.log2(row.gain)
         span = float(np.nanquantile(np.abs(logs), 0.98)) if np.isfinite(logs).any() else 1.0
         span = min(max(span, 1.0), 4.0)
