@@ -1,4 +1,4 @@
-"""The command `pssflow`: render, compare, info.
+"""The command `pssflow`: render, compare, inspect, info.
 
 Everything here is about arguments and output; what happens is in `render.py` and `compare.py`. Arguments are checked,
 and outputs are found to be writable, before the scene is loaded.
@@ -315,6 +315,73 @@ def compare(
         terminal.out.print(comparison.reference_line(), highlight=False, soft_wrap=True)
         names = ", ".join(path.name for path in written)
         terminal.out.print(f"wrote {folder}: {names}", highlight=False, soft_wrap=True)
+
+
+@commands.command("inspect")
+@_scene_options
+@click.option("-o", "--output", required=True, metavar="OUT.png", help="The picture.")
+@click.option("--pixel", metavar="X,Y", help="Look at the surface seen there.")
+@click.option("--map", "as_map", is_flag=True, help="Look at the whole image.")
+@click.option(
+    "--guides",
+    type=GuideNames(),
+    default="direction-table,auto",
+    show_default=True,
+    help="Guides, joined by commas.",
+)
+@click.option(
+    "--spp", type=click.IntRange(4, 1 << 24), default=16, show_default=True, help="Of each render."
+)
+@click.option("--k", type=click.IntRange(1, 32), default=2, show_default=True, help="Bounces.")
+@click.option("--seed", type=click.IntRange(0, 2**64 - 1), default=0, show_default=True)
+@click.option("--threads", type=click.IntRange(1, 4096), help="[default: one a core]")
+@click.option("-q", "--quiet", is_flag=True, help="No progress, no notices.")
+@click.pass_obj
+def inspect_command(
+    terminal: Terminal,
+    *,
+    output: str,
+    pixel: str | None,
+    as_map: bool,
+    guides: tuple[str, ...],
+    spp: int,
+    k: int,
+    seed: int,
+    threads: int | None,
+    quiet: bool,
+    **options: Any,
+) -> None:
+    """Draw what a surface is lit by and what guides make of it (--pixel), or where in the image they pay (--map)."""
+    from .guide import choose
+    from .inspect import at_pixel, over_image
+
+    terminal.quiet = quiet
+    if (pixel is None) != as_map:
+        raise click.UsageError("give one of --pixel X,Y and --map")
+    if not output.lower().endswith(".png"):
+        raise click.UsageError(f"--output {output!r} must end in .png")
+    check_writable(output)
+    for guide in guides:
+        choose(guide, {})
+    place = None if pixel is None else _column_and_row(pixel)
+    _exclude(options, "--size", "--scale")
+    scene = _load(terminal, options)
+    common: dict[str, Any] = {
+        "spp": spp, "k": k, "seed": seed, "threads": threads, "progress": not quiet,
+    }  # fmt: skip
+    if place is None:
+        over_image(scene, guides, **common).draw(output)
+    else:
+        at_pixel(scene, place, guides, **common).draw(output)
+    terminal.out.print(f"wrote {output}", highlight=False, soft_wrap=True)
+
+
+def _column_and_row(text: str) -> tuple[int, int]:
+    try:
+        x, y = (int(part) for part in text.split(","))
+    except ValueError:
+        raise click.UsageError(f"--pixel {text!r}: expected a column and a row, as 64,48") from None
+    return x, y
 
 
 @commands.command()

@@ -184,9 +184,10 @@ fn chunked_moments(grid: &Grid, records: &Records<'_>, rows: &[Row]) -> Vec<f64>
 /// New borders, between which the bins' damped moments are equal (Lepage 1978, eqs. 12 to 15; 2021, §II).
 fn divide(edges: &[f32], d: &[f64], alpha: f64) -> Vec<f32> {
     let bins = d.len();
+    // Of weight 6/8 in the middle (2021): with equal weights bins that alternate in width would look alike.
     let smooth = |bin: usize| {
-        let near = &d[bin.saturating_sub(1)..(bin + 2).min(bins)];
-        near.iter().sum::<f64>() / near.len() as f64
+        let (before, after) = (d[bin.saturating_sub(1)], d[(bin + 1).min(bins - 1)]);
+        (before + 6.0 * d[bin] + after) / 8.0
     };
     let smoothed: Vec<f64> = (0..bins).map(smooth).collect();
     let sum: f64 = smoothed.iter().sum();
@@ -231,7 +232,8 @@ fn divide(edges: &[f32], d: &[f64], alpha: f64) -> Vec<f32> {
 mod tests {
     use super::*;
 
-    /// With f = 2u the best density is f itself: after many iterations border i of n stands at √(i/n).
+    /// With f = 2u the best density is f itself: after many iterations border i of n stands at √(i/n), but for the
+    /// smoothing of so few bins, .022 at the first.
     #[test]
     fn the_bins_approach_the_best_density() {
         let n = 40_000;
@@ -261,7 +263,7 @@ mod tests {
         let grid = fit(&options, &records, &mut rows, &mut |_| true).unwrap();
         for (i, edge) in grid.edges(0).iter().enumerate() {
             let want = (i as f32 / 8.0).sqrt();
-            assert!((edge - want).abs() < 0.02, "border {i}: {edge}, not {want}");
+            assert!((edge - want).abs() < 0.03, "border {i}: {edge}, not {want}");
         }
     }
 
