@@ -1,8 +1,8 @@
 """Methods × scenes × seeds at given times: the runs of a study, measured, kept, and resumed.
 
 Within a scene the methods take turns, seed by seed and each time in another order, so that whatever else the machine
-does hits all of them alike. One run goes to the longest time and hands out its image at the shorter ones. A finished run is
-kept at once; what was kept under the same configuration is not run again.
+does hits all of them alike. One run goes to the longest time and hands out its image at the shorter ones. A finished
+run is kept at once; what was kept under the same configuration is not run again.
 """
 
 from __future__ import annotations
