@@ -73,6 +73,10 @@ bench: build ## paths per second beside the rays alone and beside Mitsuba
 coverage: build ## every scene beside Mitsuba, by mean and by speed: docs/coverage.md
 	$(BIN)/python -m pssflow.study.coverage
 
+.PHONY: study-guides
+study-guides: build ## what each guide gains, costs and comes to at equal time: an hour, out/study-guides; resumes
+	$(BIN)/python -m pssflow study guides -o out/study-guides
+
 .PHONY: docs
 docs: build $(VENV)/.docs ## Rust API into target/doc, Python API into out/docs
 	RUSTDOCFLAGS="-D warnings" cargo doc --workspace --no-deps

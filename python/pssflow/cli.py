@@ -1,4 +1,4 @@
-"""The command `pssflow`: render, compare, inspect, info.
+"""The command `pssflow`: render, compare, inspect, info, and the studies.
 
 Everything here is about arguments and output; what happens is in `render.py` and `compare.py`. Arguments are checked,
 and outputs are found to be writable, before the scene is loaded.
@@ -17,6 +17,7 @@ import click
 from .files import check_writable, first_line
 from .options import COMBINATIONS, EMITTER_STRATEGIES, PARAMETRISATIONS, PRESETS
 from .params import GuideNames, GuideOption, GuideSetting, Positive, SceneParameter, Size
+from .study.registry import Studies
 from .terminal import Terminal, run_command
 from .thesis import SCENES as THESIS_SCENES
 
@@ -410,6 +411,11 @@ def info(terminal: Terminal, *, as_json: bool, **options: Any) -> None:
     else:
         for part in report.scene_info(record):
             terminal.out.print(part, soft_wrap=isinstance(part, str), highlight=False)
+
+
+@commands.group(cls=Studies)
+def study() -> None:
+    """Measure methods on many scenes: tables, charts, and a row a run; what was interrupted resumes."""
 
 
 def _exr(output: str) -> Path:

@@ -23,6 +23,8 @@ __all__ = [
     "Estimate",
     "epsilon",
     "finite_or_none",
+    "floor",
+    "mape",
     "mean_and_error",
     "relative_error",
     "relative_variance",
@@ -106,6 +108,63 @@ def relmse_with_error(
     return Estimate(value, _standard_error(errors))
 
 
+def mape(image: ArrayLike, reference: ArrayLike) -> float:
+    """Mean over pixels and channels of |x − r|/(r + 0.1 · mean r). What noise the truth has is in it.
+
+    Raises:
+        ValueError: as `relmse`.
+    """
+    x, r = _checked(image, "image"), _checked(reference, "reference")
+    _same_shape(x, r, "image")
+    return float(_divide(np.abs(x - r), np.abs(r) + math.sqrt(epsilon(r))).mean())
+
+
+BLOCK = 16
+"""Side in pixels of the blocks whose spread is the error of `floor`: wider than any reconstruction filter."""
+
+
+def floor(
+    images: Sequence[ArrayLike], reference: ArrayLike, reference_variance: ArrayLike | None = None
+) -> Estimate:
+    """What of the relMSE no time would take away: the squared bias, from independent images of one method.
+
+    The mean over pairs i ≠ j of (xᵢ − r)(xⱼ − r)/(r² + ε), minus the truth's own relative variance: noise of different
+    seeds has no common part, so its expectation is relMSE without the variance, and zero for an unbiased method. The
+    standard error is that of blocks of 16² pixels.
+
+    Args:
+        images: two or more, (H, W, 3), of different seeds.
+        reference: the truth.
+        reference_variance: its variance of the mean; None for an exact one.
+
+    Raises:
+        ValueError: fewer than two images, or as `relmse`.
+    """
+    if len(images) < 2:
+        raise ValueError(f"`images` holds {len(images)}; a floor needs two or more seeds")
+    r = _checked(reference, "reference")
+    total, squares = np.zeros_like(r), np.zeros_like(r)
+    for image in images:
+        x = _checked(image, "image")
+        _same_shape(x, r, "image")
+        total += x - r
+        squares += (x - r) ** 2
+    n = len(images)
+    scale = r * r + epsilon(r)
+    product = _divide_signed((total**2 - squares) / (n * (n - 1)), scale)
+    if reference_variance is not None:
+        product -= _divide(_checked(reference_variance, "reference_variance"), scale)
+    rows, columns = (range(0, size, BLOCK) for size in product.shape[:2])
+    blocks = [product[y : y + BLOCK, x : x + BLOCK] for y in rows for x in columns]
+    sizes = np.array([block.size for block in blocks], np.float64)
+    sums = np.array([block.sum() for block in blocks])
+    value = float(sums.sum() / sizes.sum())
+    if len(blocks) < 2:
+        return Estimate(value, math.nan)
+    spread = ((sums - value * sizes) ** 2).sum() * len(blocks) / (len(blocks) - 1)
+    return Estimate(value, float(math.sqrt(spread) / sizes.sum()))
+
+
 def relative_variance(variance: ArrayLike, reference: ArrayLike) -> float:
     """Mean over pixels and channels of variance/(r² + ε): relMSE's formula with a variance of the mean.
 
@@ -162,6 +221,11 @@ def _divide(numerator: F64, denominator: F64) -> F64:
     """A ratio that is 0 for 0/0 and infinite for x/0, without a warning: black truths are legal."""
     limit = np.where(numerator > 0.0, math.inf, 0.0)
     return np.divide(numerator, denominator, out=limit, where=denominator > 0.0)
+
+
+def _divide_signed(numerator: F64, denominator: F64) -> F64:
+    """A ratio of either sign; 0 where the truth is black."""
+    return np.divide(numerator, denominator, out=np.zeros_like(numerator), where=denominator > 0.0)
 
 
 def _standard_error(values: F64) -> float:

@@ -34,6 +34,7 @@ from ..terminal import Terminal, run_command
 from . import parity
 from .bench import LLVM, RAYS_ALONE, SCALAR, Contestant, contestants, loader, measure
 from .parity import BOUNCES, SIDE, Plan
+from .store import commit
 from .welch import ALPHA, LUMINANCE
 
 TARGETS = {LLVM: 1.4, SCALAR: 3.0}
@@ -111,20 +112,6 @@ def all_plans() -> list[Plan]:
     plans = parity.shared_plans(shared) if shared else []
     own = [replace(plan, name=f"scenes/{plan.name}") for plan in parity.own_plans()]
     return own + plans
-
-
-def commit() -> str:
-    """The checked-out commit, with a plus sign if files differ from it; `unknown` outside a repository."""
-    try:
-        described = subprocess.run(
-            ["git", "describe", "--always", "--abbrev=8", "--exclude=*", "--dirty=+"],
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
-    return described.stdout.strip()
 
 
 def examine(plan: Plan, effort: float, rounds: int, threads: int) -> dict[str, Any]:

@@ -1,0 +1,269 @@
+"""Charts of a study: error against wall time, and ratios at equal time.
+
+Methods are told apart by colour (Okabe and Ito's palette, which colour-blind readers can tell apart), marker and line,
+so that a copy in black and white can be read, too. Every chart is written as PNG and as SVG.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ..files import write_beside
+from ..metrics import Estimate
+from ..report import scene_title
+from .store import Row
+from .summary import BASELINE, Cell, Overall
+
+__all__ = ["error_chart", "ratio_chart", "style"]
+
+COLOURS = ("#000000", "#e69f00", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#7f7f7f")
+MARKERS = "osD^vPX*"
+LINES = ("-", "--", "-.", (0, (1, 1)), (0, (5, 1)), (0, (3, 1, 1, 1, 1, 1)))
+MUTED = "#666666"
+
+
+def style(methods: Sequence[str], method: str) -> dict[str, Any]:
+    """Colour, marker and line of a method: the same in every chart of a study."""
+    i = methods.index(method)
+    return {
+        "color": COLOURS[i % len(COLOURS)],
+        "marker": MARKERS[i % len(MARKERS)],
+        "linestyle": LINES[i % len(LINES)],
+    }
+
+
+def error_chart(
+    path: Path,
+    title: str,
+    rows: Sequence[Row],
+    methods: Sequence[str],
+    *,
+    measure: str = "relmse",
+    label: str = "relMSE",
+    caption: str = "",
+) -> list[Path]:
+    """Error against seconds used, log-log, a panel a scene: means over seeds, and a band from the least to the largest.
+
+    The dotted line has slope −1, how relMSE falls; below the dashed one errors drown in the truth's own noise.
+
+    Raises:
+        OSError: a file cannot be written.
+    """
+    scenes = list(dict.fromkeys(row.scene for row in rows))
+    columns = min(3, len(scenes))
+    lines = math.ceil(len(scenes) / columns)
+    figure = _figure(3.5 * columns + 0.7, 2.9 * lines + 2.1)
+    for i, scene in enumerate(scenes):
+        axes = figure.add_subplot(lines, columns, i + 1)
+        own = [row for row in rows if row.scene == scene]
+        for method in methods:
+            _curve(
+                axes, [row for row in own if row.method == method], measure, style(methods, method)
+            )
+        _guides(axes, own, measure)
+        _scene_axes(
+            axes, scene_title(scene), label if i % columns == 0 else "", i >= len(scenes) - columns
+        )
+    handles = _legend_handles(methods)
+    from matplotlib.lines import Line2D
+
+    handles.append(Line2D([], [], color=MUTED, linestyle=":", label="slope −1"))
+    if measure == "relmse":
+        handles.append(
+            Line2D([], [], color=MUTED, linestyle="--", label="the reference’s own variance")
+        )
+    return _finish(figure, path, title, handles, caption)
+
+
+def ratio_chart(
+    path: Path,
+    title: str,
+    found: Sequence[Cell],
+    summary: Sequence[Overall],
+    methods: Sequence[str],
+    caption: str = "",
+) -> list[Path]:
+    """Ratios to random sampling at equal time by scene, and their geometric mean; bars of two standard errors.
+
+    Raises:
+        OSError: a file cannot be written.
+    """
+    times = sorted({cell.time for cell in found})
+    scenes = list(dict.fromkeys(cell.scene for cell in found))
+    others = [method for method in methods if method != BASELINE]
+    labels = [*(scene_title(scene) for scene in scenes), "geometric mean"]
+    height = 0.16 * max(len(others), 2) + 0.1
+    figure = _figure(3.6 * len(times) + 1.6, height * len(labels) + 2.2)
+    first = None
+    for i, time in enumerate(times):
+        axes = figure.add_subplot(1, len(times), i + 1, sharex=first, sharey=first)
+        first = first or axes
+        for j, method in enumerate(others):
+            points: list[tuple[int, Estimate]] = [
+                (scenes.index(cell.scene), cell.equal_time)
+                for cell in found
+                if (cell.method, cell.time) == (method, time) and cell.equal_time is not None
+            ]
+            points += [
+                (len(scenes), total.mean)
+                for total in summary
+                if (total.method, total.time) == (method, time)
+            ]
+            if not points:
+                continue
+            offset = ((j + 0.5) / len(others) - 0.5) * 0.72
+            values = [value for _, (value, _) in points]
+            bars = [_bars(estimate) for _, estimate in points]
+            axes.errorbar(
+                values,
+                [row + offset for row, _ in points],
+                xerr=list(zip(*bars, strict=True)),
+                **style(methods, method) | {"linestyle": "none"},
+                markersize=5,
+                elinewidth=1.2,
+                capsize=2,
+            )
+        axes.axvline(1.0, color="black", linewidth=1)
+        for row in range(len(labels)):
+            if row % 2:
+                axes.axhspan(row - 0.5, row + 0.5, color="#f2f2f2", zorder=0)
+        axes.axhline(len(scenes) - 0.5, color=MUTED, linewidth=1)
+        axes.set_xscale("log")
+        _plain_ticks(axes.xaxis)
+        axes.set_ylim(len(labels) - 0.5, -0.5)
+        axes.set_yticks(range(len(labels)), labels)
+        axes.tick_params(axis="y", length=0, labelleft=i == 0)
+        axes.set_title(f"{time:g} s", fontsize=10)
+        axes.set_xlabel(
+            "relMSE of random sampling ÷ of the guide\n(equal time; right of 1 is a gain)",
+            fontsize=8.5,
+        )
+        axes.grid(axis="x", which="both", color="#dddddd", linewidth=0.5)
+        axes.set_axisbelow(True)
+    return _finish(figure, path, title, _legend_handles(others, methods), caption)
+
+
+def _curve(axes: Any, rows: Sequence[Row], measure: str, look: dict[str, Any]) -> None:
+    times = sorted({row.time for row in rows})
+    x, y, low, high = [], [], [], []
+    for time in times:
+        values = [getattr(row, measure) for row in rows if row.time == time]
+        mean = sum(values) / len(values)
+        if mean <= 0.0:
+            continue  # drowned: a logarithm has no place for it
+        elapsed = [row.elapsed for row in rows if row.time == time]
+        x.append(sum(elapsed) / len(elapsed))
+        y.append(mean)
+        low.append(max(min(values), 0.1 * mean))
+        high.append(max(values))
+    if x:
+        axes.plot(x, y, **look, linewidth=1.6, markersize=4.5)
+        axes.fill_between(x, low, high, color=look["color"], alpha=0.15, linewidth=0)
+
+
+def _guides(axes: Any, rows: Sequence[Row], measure: str) -> None:
+    """The slope, through the middle of what is drawn, and the truth's noise."""
+    positive = [(row.elapsed, getattr(row, measure)) for row in rows if getattr(row, measure) > 0.0]
+    if not positive or measure == "mape":
+        return
+    left, right = min(x for x, _ in positive), max(x for x, _ in positive)
+    middle = math.exp(sum(math.log(x * y) for x, y in positive) / len(positive))
+    if right > left:
+        axes.plot(
+            [left, right],
+            [middle / left, middle / right],
+            color=MUTED,
+            linestyle=":",
+            linewidth=1.2,
+            zorder=1,
+        )
+    noise = rows[-1].reference_variance
+    if measure == "relmse" and noise > 0.0:
+        axes.axhline(noise, color=MUTED, linestyle="--", linewidth=1, zorder=1)
+
+
+def _scene_axes(axes: Any, title: str, label: str, last: bool) -> None:
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    _plain_ticks(axes.xaxis)
+    axes.set_title(title, fontsize=10)
+    axes.set_ylabel(label)
+    if last:
+        axes.set_xlabel("wall time used (s)")
+    axes.grid(which="both", color="#e3e3e3", linewidth=0.5)
+    axes.set_axisbelow(True)
+    axes.tick_params(labelsize=8, which="both")
+
+
+def _plain_ticks(axis: Any) -> None:
+    """1, 3, 10 in place of 10⁰, 10¹: decades alone leave most of these axes without a number."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axis.set_major_locator(LogLocator(10, subs=(1.0, 2.0, 5.0), numticks=12))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def _bars(estimate: Estimate) -> tuple[float, float]:
+    """Two standard errors to either side; on a logarithmic axis the lower end stays above zero."""
+    value, error = estimate
+    if not math.isfinite(error):
+        return 0.0, 0.0
+    return min(2.0 * error, 0.9 * value), 2.0 * error
+
+
+def _legend_handles(methods: Sequence[str], all_methods: Sequence[str] | None = None) -> list[Any]:
+    from matplotlib.lines import Line2D
+
+    known = all_methods or methods
+    return [
+        Line2D([], [], label=method, **style(known, method), markersize=5) for method in methods
+    ]
+
+
+def _figure(width: float, height: float) -> Any:
+    # No pyplot: it would pick a window system and keep figures alive.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(max(width, 6.4), height), dpi=150, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _finish(
+    figure: Any, path: Path, title: str, handles: Sequence[Any], caption: str
+) -> list[Path]:
+    """Title, legend and caption; then both files."""
+    import textwrap
+
+    width = figure.get_figwidth()
+    wrapped = "\n".join(textwrap.wrap(title, int(width * 11)))
+    figure.suptitle(wrapped, fontsize=11, x=0.01, ha="left")
+    # The caption is the legend's heading: text of its own would lie over the legend.
+    legend = figure.legend(
+        handles=list(handles),
+        loc="outside lower left",
+        ncols=max(1, int(width // 2.1)),
+        fontsize=8.5,
+        frameon=False,
+        title="\n".join(textwrap.wrap(caption, int(width * 14))) or None,
+        title_fontsize=7.5,
+        alignment="left",
+    )
+    legend.get_title().set_color(MUTED)
+    written = [path.with_suffix(".png"), path.with_suffix(".svg")]
+    for target in written:
+        kind = target.suffix[1:]
+        # Without a date two runs over the same rows give the same file.
+        metadata = {"Date": None} if kind == "svg" else None
+        write_beside(
+            target,
+            lambda part, kind=kind, metadata=metadata: figure.savefig(
+                part, format=kind, metadata=metadata
+            ),
+        )
+    return written

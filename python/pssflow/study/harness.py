@@ -1,0 +1,323 @@
+"""Methods × scenes × seeds at given times: the runs of a study, measured, kept, and resumed.
+
+Within a scene the methods take turns, seed by seed and each time in another order, so that whatever else the machine
+does hits all of them alike. One run goes to the longest time and hands out its image at the shorter ones. A finished
+run is kept at once; what was kept under the same configuration is not run again.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import _core, metrics
+from ..files import first_line
+from ..output import make_folder
+from ..progress import Progress
+from ..reference import Reference, read_exr
+from .store import Row, Store, commit, configuration, processor
+
+__all__ = ["Case", "Method", "Scenery", "Shot", "Study", "image_path", "reference_path"]
+
+F32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Shot:
+    """What a method had after a time."""
+
+    time: float
+    """Seconds that were allowed."""
+    elapsed: float
+    """Seconds that were used."""
+    image: F32
+    """(H, W, 3)"""
+    variance: F32 | None
+    """Of the mean, (H, W, 3), where the method knows it."""
+    spp: int
+    chosen: str = ""
+    nonzero_share: float | None = None
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    """By phase: `pilot`, `fit`, `render`."""
+
+
+Runner = Callable[[Any, int, Sequence[float], Progress], Sequence[Shot]]
+"""Renders a case's scene with a seed; returns a shot for each of the increasing times. Training is inside them."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """A way to render, as the charts name it."""
+
+    name: str
+    run: Runner
+    options: Mapping[str, Any] = field(default_factory=dict)
+    """What sets it apart, for the record and the configuration's hash."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scene, ready to be rendered, and its truth."""
+
+    digest: str
+    """Hash of what is rendered."""
+    scene: Any
+    truth: Callable[[], Reference]
+    """Called once, before the first run that is not there yet."""
+    warm_up: Callable[[], object] = lambda: None
+    """Called before the first run: what happens only once is no method's cost."""
+
+
+@dataclass(frozen=True)
+class Scenery:
+    """A scene to come: loaded when its turn has come, let go after it."""
+
+    name: str
+    open: Callable[[], Case]
+
+
+@dataclass
+class Study:
+    """The runs of a study.
+
+    Args:
+        folder: where results.csv and the images lie.
+        sceneries: the scenes.
+        methods: the methods.
+        times: seconds, increasing; a run goes to the last.
+        seeds: numbers of the seeds.
+        settings: what all runs share, for the rows and the configuration's hash: `k`, `emitter_strategy`, `threads`.
+        say: told what is being done.
+        progress: as in `pssflow.render`.
+        publish: called with the rows so far after each scene.
+    """
+
+    folder: Path
+    sceneries: Sequence[Scenery]
+    methods: Sequence[Method]
+    times: Sequence[float]
+    seeds: Sequence[int]
+    settings: Mapping[str, Any]
+    say: Callable[[str], None] = lambda text: None
+    progress: Progress = False
+    publish: Callable[[Sequence[Row]], object] = lambda rows: None
+
+    def __post_init__(self) -> None:
+        make_folder(self.folder / "images")
+        self.store = Store(self.folder / "results.csv")
+        self.failures: dict[str, str] = {}
+        """Scenes that could not be loaded, and why."""
+
+    @property
+    def rows(self) -> list[Row]:
+        """Rows of this study's scenes, methods, seeds and times; others in the file are left alone."""
+        scenes = {scenery.name for scenery in self.sceneries}
+        methods = {method.name for method in self.methods}
+        return [
+            row
+            for row in self.store.rows
+            if row.scene in scenes
+            and row.method in methods
+            and row.seed in self.seeds
+            and row.time in self.times
+            and row.longest == self.times[-1]
+        ]
+
+    def run(self) -> list[Row]:
+        """Runs what is not there yet; on Ctrl-C what there is, is published.
+
+        Raises:
+            KeyboardInterrupt: on Ctrl-C; finished runs are kept.
+        """
+        clock = _Clock(len(self.sceneries) * len(self.methods) * len(self.seeds), self.times[-1])
+        try:
+            for scenery in self.sceneries:
+                try:
+                    case = scenery.open()
+                except (OSError, ValueError, RuntimeError) as error:
+                    self.failures[scenery.name] = first_line(error)
+                    self.say(f"{scenery.name} is left out: {first_line(error)}")
+                    clock.skip(len(self.methods) * len(self.seeds))
+                    continue
+                if self._scene(scenery.name, case, clock):
+                    self.publish(self.rows)
+        except KeyboardInterrupt:
+            self.publish(self.rows)
+            raise
+        return self.rows
+
+    def _scene(self, name: str, case: Case, clock: _Clock) -> bool:
+        """The runs of one scene; whether there were any."""
+        wanted = []
+        for turn, seed in enumerate(self.seeds):
+            shift = turn % len(self.methods)
+            for method in [*self.methods[shift:], *self.methods[:shift]]:
+                key = configuration(
+                    scene=[name, case.digest],
+                    method=method.name,
+                    options=method.options,
+                    times=list(self.times),
+                    seed=seed,
+                    settings=dict(self.settings),
+                )
+                wanted.append((method, seed, key))
+        missing = [run for run in wanted if not self.store.has(run[2])]
+        clock.skip(len(wanted) - len(missing))
+        if not missing:
+            return False
+        self.say(f"{name}: Mitsuba's reference, unless it is cached")
+        truth = case.truth()
+        truth.write(reference_path(self.folder, name))
+        case.warm_up()
+        for method, seed, key in missing:
+            self.say(f"{clock.place()} {name}, {method.name}, seed {seed}; {clock.left()}")
+            with clock.run():
+                before = os.getloadavg()[0]
+                shots = method.run(case.scene, seed, self.times, self.progress)
+                after = os.getloadavg()[0]
+                common = self._common(name, method, seed, key, before, after)
+                self._keep_images(name, method, seed, shots)
+                self.store.put([measured(shot, truth, common) for shot in shots])
+        return True
+
+    def _common(
+        self, name: str, method: Method, seed: int, key: str, before: float, after: float
+    ) -> dict[str, Any]:
+        import mitsuba as mi
+
+        return {
+            "scene": name,
+            "method": method.name,
+            "seed": seed,
+            "longest": self.times[-1],
+            "k": self.settings["k"],
+            "emitter_strategy": self.settings["emitter_strategy"],
+            "threads": self.settings["threads"],
+            "load_before": before,
+            "load_after": after,
+            "options": json.dumps(dict(method.options), sort_keys=True),
+            "configuration": key,
+            "commit": commit(),
+            "version": _core.__version__,
+            "mitsuba": mi.__version__,
+            "processor": processor(),
+            "when": datetime.now(timezone.utc).strftime("%Y-%m-%dT%H:%M:%SZ"),
+        }
+
+    def _keep_images(self, name: str, method: Method, seed: int, shots: Sequence[Shot]) -> None:
+        """Every seed's last image, and all images of the first seed."""
+        kept = shots if seed == self.seeds[0] else shots[-1:]
+        for shot in kept:
+            layers = {"": shot.image}
+            # What one sample a pixel says of its variance is infinite, which no reader likes.
+            if shot.variance is not None and np.isfinite(shot.variance).all():
+                layers["variance"] = shot.variance
+            path = image_path(self.folder, name, method.name, seed, shot.time)
+            _core.write_exr(str(path), layers)
+
+    def floors(self) -> dict[tuple[str, str], metrics.Estimate]:
+        """The squared bias that the last images of several seeds have in common, by scene and method."""
+        found: dict[tuple[str, str], metrics.Estimate] = {}
+        if len(self.seeds) < 2:
+            return found
+        done = {row.run for row in self.rows}
+        for scenery in self.sceneries:
+            truth = None
+            for method in self.methods:
+                runs = [(scenery.name, method.name, seed) for seed in self.seeds]
+                if any(run not in done for run in runs):
+                    continue
+                paths = [image_path(self.folder, *run, self.times[-1]) for run in runs]
+                reference = reference_path(self.folder, scenery.name)
+                if not all(path.is_file() for path in (*paths, reference)):
+                    continue
+                truth = truth or read_exr(reference)
+                images = [read_exr(path).image for path in paths]
+                found[scenery.name, method.name] = metrics.floor(
+                    images, truth.image, truth.variance
+                )
+        return found
+
+
+def measured(shot: Shot, truth: Reference, common: Mapping[str, Any]) -> Row:
+    """A shot's row.
+
+    Raises:
+        ValueError: the image and the truth differ in size.
+    """
+    height, width = shot.image.shape[:2]
+    own = None
+    if shot.variance is not None and np.isfinite(shot.variance).all():
+        own = metrics.finite_or_none(metrics.relative_variance(shot.variance, truth.image))
+    return Row(
+        **common,
+        time=shot.time,
+        elapsed=shot.elapsed,
+        chosen=shot.chosen,
+        width=width,
+        height=height,
+        spp=shot.spp,
+        paths=shot.spp * width * height,
+        **{f"seconds_{phase}": shot.seconds.get(phase) for phase in ("pilot", "fit", "render")},
+        nonzero_share=shot.nonzero_share,
+        relmse=metrics.relmse(shot.image, truth.image, truth.variance),
+        relmse_trimmed=metrics.relmse_trimmed(shot.image, truth.image, truth.variance),
+        mape=metrics.mape(shot.image, truth.image),
+        own_variance=own,
+        reference_variance=metrics.relative_variance(truth.variance, truth.image),
+        reference_seconds=truth.seconds,
+    )
+
+
+def image_path(folder: Path, scene: str, method: str, seed: int, seconds: float) -> Path:
+    """Where an image of a run lies."""
+    return folder / "images" / f"{file_name(scene)}-{file_name(method)}-s{seed}-{seconds:g}s.exr"
+
+
+def reference_path(folder: Path, scene: str) -> Path:
+    """Where a scene's truth lies."""
+    return folder / "images" / f"{file_name(scene)}-reference.exr"
+
+
+def file_name(name: str) -> str:
+    """A name without what a file's may not have."""
+    return "".join(c if c.isalnum() or c in "+._-" else "_" for c in name)
+
+
+class _Clock:
+    """Which run it is, and how long all will take."""
+
+    def __init__(self, runs: int, each: float) -> None:
+        self.runs, self.done, self.timed = runs, 0, 0
+        self.seconds, self.each = 0.0, each
+
+    def skip(self, runs: int) -> None:
+        self.done += runs
+
+    @contextmanager
+    def run(self) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        self.done += 1
+        self.timed += 1
+        self.seconds += time.perf_counter() - start
+
+    def place(self) -> str:
+        return f"[{self.done + 1}/{self.runs}]"
+
+    def left(self) -> str:
+        """References to come are not in it: nobody knows which are cached."""
+        each = self.seconds / self.timed if self.timed else self.each
+        minutes = each * (self.runs - self.done) / 60
+        return f"about {math.ceil(minutes)} min left"

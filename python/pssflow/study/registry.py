@@ -1,0 +1,37 @@
+"""The studies by name: `pssflow study NAME`. A new one is a file with a click command, and a line here."""
+
+from __future__ import annotations
+
+from importlib import import_module
+
+import click
+
+__all__ = ["STUDIES", "Studies"]
+
+STUDIES = {
+    "guides": (
+        "guides",
+        "What each guide gains, costs and comes to at equal time; what `auto` chose.",
+    ),
+}
+"""Name → the module in this package that defines a command of that name, and what it shows."""
+
+
+class Studies(click.Group):
+    """A group whose commands are imported when they are called for: help needs neither Mitsuba nor matplotlib."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """In the registry's order."""
+        return list(STUDIES)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """The command of that name, imported."""
+        if cmd_name not in STUDIES:
+            return None
+        module = import_module(f".{STUDIES[cmd_name][0]}", __package__)
+        return getattr(module, cmd_name.replace("-", "_"))
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """The list in `--help`, without importing anything."""
+        with formatter.section("Studies"):
+            formatter.write_dl([(name, what) for name, (_, what) in STUDIES.items()])

@@ -1,0 +1,181 @@
+"""results.csv: a row for each image that a study measured.
+
+A run (one method, one scene, one seed) yields as many rows as it had times. The file is rewritten whole and renamed, so
+that it never holds half a run, whatever interrupts the study.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import hashlib
+import json
+import os
+import platform
+import subprocess
+from collections.abc import Iterable, Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from ..files import first_line, write_beside
+
+__all__ = ["Row", "Store", "commit", "configuration", "processor"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One image and its errors. Radiances are relative to the reference, as in relMSE (`pssflow.metrics`)."""
+
+    scene: str
+    method: str
+    seed: int
+    time: float
+    """Budget in seconds; pilot, training and selection inside, loading outside."""
+    elapsed: float
+    """Seconds really used."""
+    longest: float
+    """Seconds of the run that this is a part of."""
+    chosen: str
+    """What drew the last pass."""
+    width: int
+    height: int
+    k: int
+    emitter_strategy: str
+    spp: int
+    """Samples per pixel in the image."""
+    paths: int
+    seconds_pilot: float | None
+    seconds_fit: float | None
+    seconds_render: float | None
+    nonzero_share: float | None
+    """Paths that carry light, of those found."""
+    relmse: float
+    relmse_trimmed: float
+    mape: float
+    own_variance: float | None
+    """The image's relMSE as predicted by its own variance, without the truth's noise."""
+    reference_variance: float
+    """The truth's own, in the same measure: subtracted from `relmse`."""
+    reference_seconds: float
+    threads: int
+    load_before: float
+    """Load average of one minute; it holds the run itself as well."""
+    load_after: float
+    options: str
+    """The method's own, JSON."""
+    configuration: str
+    """Hash of all that decides the row, but for the machine."""
+    commit: str
+    version: str
+    mitsuba: str
+    processor: str
+    when: str
+
+    @property
+    def run(self) -> tuple[str, str, int]:
+        """Scene, method, seed."""
+        return self.scene, self.method, self.seed
+
+    @classmethod
+    def parse(cls, texts: Mapping[str, str]) -> Row:
+        """A row as the file has it.
+
+        Raises:
+            ValueError: a column is missing or holds no number.
+        """
+        values: dict[str, Any] = {}
+        for item in dataclasses.fields(cls):
+            text = texts.get(item.name)
+            if text is None:
+                raise ValueError(f"column `{item.name}` is missing")
+            kind = str(item.type)
+            if text == "" and "None" in kind:
+                values[item.name] = None
+            elif kind.startswith("int"):
+                values[item.name] = int(text)
+            elif kind.startswith("float"):
+                values[item.name] = float(text)
+            else:
+                values[item.name] = text
+        return cls(**values)
+
+
+class Store:
+    """The rows of one file.
+
+    Raises:
+        ValueError: the file is there, but is none of ours.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self.rows: list[Row] = []
+        if self.path.exists():
+            try:
+                with self.path.open(newline="", encoding="utf-8") as file:
+                    self.rows = [Row.parse(texts) for texts in csv.DictReader(file)]
+            except (OSError, ValueError, csv.Error) as error:
+                raise ValueError(
+                    f"{self.path}: is no table of this version of pssflow ({first_line(error)}); "
+                    "move it away, or choose another folder"
+                ) from None
+
+    def has(self, configuration: str) -> bool:
+        """Whether a finished run of this configuration is there."""
+        return any(row.configuration == configuration for row in self.rows)
+
+    def put(self, rows: Iterable[Row]) -> None:
+        """Writes the rows of one run, in place of those of the same scene, method and seed.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
+        new = list(rows)
+        runs = {row.run for row in new}
+        self.rows = [row for row in self.rows if row.run not in runs] + new
+
+        def write(part: Path) -> None:
+            with part.open("w", newline="", encoding="utf-8") as file:
+                names = [item.name for item in dataclasses.fields(Row)]
+                writer = csv.DictWriter(file, names, lineterminator="\n")
+                writer.writeheader()
+                writer.writerows(dataclasses.asdict(row) for row in self.rows)
+
+        write_beside(self.path, write)
+
+
+def configuration(**what: Any) -> str:
+    """Hash of all that decides a run; the compiled core, and with it the estimator, is in it."""
+    text = json.dumps(what | {"core": _core_hash()}, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+@cache
+def _core_hash() -> str:
+    from .. import _core
+
+    return hashlib.sha256(Path(str(_core.__file__)).read_bytes()).hexdigest()
+
+
+@cache
+def commit() -> str:
+    """The commit of the sources, with a plus sign if files differ from it; `unknown` outside a repository."""
+    command = ["git", "describe", "--always", "--abbrev=8", "--exclude=*", "--dirty=+"]
+    try:
+        folder = Path(__file__).parent
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return done.stdout.strip()
+
+
+@cache
+def processor() -> str:
+    """Model and number of cores."""
+    try:
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
+    except OSError:
+        text = ""
+    names = (line.partition(":")[2] for line in text.splitlines() if line.startswith("model name"))
+    return f"{os.cpu_count()} × {' '.join(next(names, platform.machine()).split())}"

@@ -1,0 +1,229 @@
+"""What the rows of a study come to: gain, cost, ratios at equal samples and at equal time, wins and losses.
+
+Errors are standard errors over seeds, of ratios by propagation; with three seeds they are themselves only known to
+about a half. A run ends a little before or after its time: the ratio at equal time is that of relMSE × seconds used,
+since relMSE falls with one over the time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from ..metrics import Estimate, mean_and_error
+from .store import Row
+
+__all__ = ["BASELINE", "CLOSE", "Cell", "Choice", "Overall", "cells", "choices", "overall"]
+
+BASELINE = "none"
+"""Random sampling: what all others are compared with."""
+
+CLOSE = 1.15
+"""`auto` is close if its error at equal time is at most this times that of the best candidate."""
+
+SIGNIFICANT = 2.0
+"""Standard errors."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One method on one scene after one time. Ratios are the baseline's ÷ the method's: above 1 is a gain."""
+
+    scene: str
+    method: str
+    time: float
+    seeds: int
+    chosen: str
+    """What drew last, of all seeds."""
+    spp: float
+    relmse: Estimate
+    relmse_trimmed: Estimate
+    mape: Estimate
+    own_variance: Estimate | None
+    reference_variance: float
+    work: Estimate
+    """relMSE × seconds used."""
+    gain: Estimate | None
+    """Variance per path, by the images' own."""
+    cost: Estimate | None
+    """Seconds a path, pilot and training inside, in the baseline's: below 1 is cheaper."""
+    equal_samples: Estimate | None
+    equal_time: Estimate | None
+
+    @property
+    def verdict(self) -> str:
+        """`win` or `loss` beyond two standard errors, `tie`, or nothing where there is nothing to compare."""
+        if self.method == BASELINE or self.equal_time is None:
+            return ""
+        ratio, error = self.equal_time
+        if not math.isfinite(error):
+            return "one seed"
+        if ratio - SIGNIFICANT * error > 1.0:
+            return "win"
+        return "loss" if ratio + SIGNIFICANT * error < 1.0 else "tie"
+
+    @property
+    def drowned(self) -> bool:
+        """Whether the error lies below the truth's own noise."""
+        return self.relmse.value < self.reference_variance
+
+
+def cells(rows: Iterable[Row]) -> list[Cell]:
+    """All cells, in the order of the rows."""
+    groups: dict[tuple[str, str, float], list[Row]] = {}
+    for row in rows:
+        groups.setdefault((row.scene, row.method, row.time), []).append(row)
+    found = []
+    for (scene, method, time), group in groups.items():
+        base = groups.get((scene, BASELINE, time))
+
+        def over(baseline: list[float] | None, own: list[float]) -> Estimate | None:
+            return (
+                None if baseline is None else ratio(mean_and_error(baseline), mean_and_error(own))
+            )
+
+        variances = [row.own_variance for row in group]
+        known = [v for v in variances if v is not None]
+        whole = len(known) == len(group)
+        base_variance = [(r.own_variance, r) for r in base or ()]
+        per_path = [v * r.spp for v, r in base_variance if v is not None]
+        found.append(
+            Cell(
+                scene=scene,
+                method=method,
+                time=time,
+                seeds=len(group),
+                chosen="/".join(sorted({row.chosen for row in group})),
+                spp=sum(row.spp for row in group) / len(group),
+                relmse=mean_and_error([row.relmse for row in group]),
+                relmse_trimmed=mean_and_error([row.relmse_trimmed for row in group]),
+                mape=mean_and_error([row.mape for row in group]),
+                own_variance=mean_and_error(known) if whole else None,
+                reference_variance=group[-1].reference_variance,
+                work=mean_and_error([row.relmse * row.elapsed for row in group]),
+                gain=over(
+                    per_path if base and len(per_path) == len(base) else None,
+                    [v * r.spp for v, r in zip(known, group, strict=True)],
+                )
+                if whole
+                else None,
+                cost=over(
+                    [row.elapsed / row.spp for row in group], [r.elapsed / r.spp for r in base]
+                )
+                if base
+                else None,
+                equal_samples=over(
+                    [r.relmse * r.spp for r in base] if base else None,
+                    [row.relmse * row.spp for row in group],
+                ),
+                equal_time=over(
+                    [r.relmse * r.elapsed for r in base] if base else None,
+                    [row.relmse * row.elapsed for row in group],
+                ),
+            )
+        )
+    return found
+
+
+def ratio(numerator: Estimate, denominator: Estimate) -> Estimate | None:
+    """A ratio of independent estimates; None where one of them is not positive, drowned in the truth's noise."""
+    if not (numerator.value > 0.0 and denominator.value > 0.0):
+        return None
+    value = numerator.value / denominator.value
+    relative = math.hypot(numerator.error / numerator.value, denominator.error / denominator.value)
+    return Estimate(value, value * relative)
+
+
+@dataclass(frozen=True)
+class Overall:
+    """One method after one time, over all scenes."""
+
+    method: str
+    time: float
+    scenes: int
+    mean: Estimate
+    """Geometric mean of the ratios at equal time."""
+    gain: Estimate | None
+    """The same of the variance per path."""
+    wins: int
+    losses: int
+    ties: int
+    worst: tuple[str, Estimate]
+    """Scene of the smallest ratio."""
+
+
+def overall(found: Sequence[Cell]) -> list[Overall]:
+    """All methods but the baseline, in the order of the cells."""
+    groups: dict[tuple[str, float], list[tuple[Cell, Estimate]]] = {}
+    for cell in found:
+        if cell.method != BASELINE and cell.equal_time is not None:
+            groups.setdefault((cell.method, cell.time), []).append((cell, cell.equal_time))
+    result = []
+    for (method, time), group in groups.items():
+        verdicts = [cell.verdict for cell, _ in group]
+        worst = min(group, key=lambda pair: pair[1].value)
+        gains = [cell.gain for cell, _ in group if cell.gain is not None]
+        result.append(
+            Overall(
+                method=method,
+                time=time,
+                scenes=len(group),
+                mean=geometric_mean([value for _, value in group]),
+                gain=geometric_mean(gains) if len(gains) == len(group) else None,
+                wins=verdicts.count("win"),
+                losses=verdicts.count("loss"),
+                ties=verdicts.count("tie"),
+                worst=(worst[0].scene, worst[1]),
+            )
+        )
+    return result
+
+
+def geometric_mean(values: Sequence[Estimate]) -> Estimate:
+    """Of independent positive estimates."""
+    mean = math.exp(sum(math.log(v.value) for v in values) / len(values))
+    relative = math.sqrt(sum((v.error / v.value) ** 2 for v in values)) / len(values)
+    return Estimate(mean, mean * relative)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """`auto` beside the best other method in hindsight, on one scene after one time."""
+
+    scene: str
+    time: float
+    best: str
+    over: Estimate
+    """Error of `auto` ÷ that of the best, at equal time."""
+
+    @property
+    def close(self) -> bool:
+        """Whether it is not worse than `CLOSE` beyond two standard errors.
+
+        The best of several noisy candidates looks better than it is; that is not corrected for.
+        """
+        error = self.over.error if math.isfinite(self.over.error) else 0.0
+        return self.over.value - SIGNIFICANT * error <= CLOSE
+
+
+def choices(found: Sequence[Cell], name: str = "auto") -> list[Choice]:
+    """`auto` against the others, wherever both were measured."""
+    result = []
+    for cell in found:
+        if cell.method != name:
+            continue
+        others = [
+            c
+            for c in found
+            if (c.scene, c.time) == (cell.scene, cell.time)
+            and c.method != name
+            and c.work.value > 0.0
+        ]
+        if not others:
+            continue
+        best = min(others, key=lambda c: c.work.value)
+        over = ratio(cell.work, best.work)
+        if over is not None:
+            result.append(Choice(cell.scene, cell.time, best.method, over))
+    return result
