@@ -119,6 +119,11 @@ impl<'a> HeldOut<'a> {
         &self.records
     }
 
+    /// What a row's ∫f²/m counts in V, but for a factor that all rows share.
+    pub(crate) fn weight(&self, row: usize) -> f64 {
+        self.scale[self.tile(row)]
+    }
+
     /// gain(a) = V(1)/V(a) of the mixture with a guide of these densities.
     pub(crate) fn gain(&self, q: &Densities, a: f32) -> f64 {
         let least = self.uniform / MOST_GAIN;

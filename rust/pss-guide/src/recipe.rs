@@ -81,9 +81,9 @@ impl Recipe {
         self.factors.iter().map(each).sum()
     }
 
-    /// Seconds of training on one core, at most, that come to it however many paths there are.
-    pub fn seconds(&self, dims: usize) -> f64 {
-        let each = |(spec, options): &(&GuideSpec, Map<_, _>)| (spec.seconds)(options, dims);
+    /// Seconds of training on one core that come to it and do not grow with the paths; see [`GuideSpec::seconds`].
+    pub fn seconds(&self, dims: usize, rows: usize) -> f64 {
+        let each = |(spec, options): &(&GuideSpec, Map<_, _>)| (spec.seconds)(options, dims, rows);
         self.factors.iter().map(each).sum()
     }
 

@@ -33,8 +33,9 @@ pub struct GuideSpec {
     /// Seconds of training that each path costs on one core, roughly, for (options, columns); 0 where it does
     /// not depend on the number of paths. A render under a time budget gives no more paths than it can afford.
     pub seconds_per_path: fn(&Map<String, Value>, usize) -> f64,
-    /// Seconds of training on one core, at most, that come to it however many paths there are, likewise.
-    pub seconds: fn(&Map<String, Value>, usize) -> f64,
+    /// Seconds of training on one core that come to it and do not grow with the paths, for (options, columns,
+    /// light-carrying paths): a net is shown few paths more often.
+    pub seconds: fn(&Map<String, Value>, usize, usize) -> f64,
     /// The defensive mixture's share of uniform paths that suits it when nothing is known of the scene.
     pub uniform_fraction: f32,
     /// What it adds to the cost of a path, in uniform paths: time of a guided pass ÷ time of a uniform one, less one. Most
@@ -60,7 +61,7 @@ static REGISTRY: &[GuideSpec] = &[
         seconds_per_path: |o, d| {
             RealNvpOptions::parse(Domain::Cube, o).map_or(0.0, |o| o.seconds_per_path(d))
         },
-        seconds: |_, _| 0.0,
+        seconds: |_, _, _| 0.0,
         uniform_fraction: 0.25,
         cost_ratio: 1.3,
         refine: false,
@@ -76,7 +77,7 @@ static REGISTRY: &[GuideSpec] = &[
         seconds_per_path: |o, d| {
             RealNvpOptions::parse(Domain::Logit, o).map_or(0.0, |o| o.seconds_per_path(d))
         },
-        seconds: |_, _| 0.0,
+        seconds: |_, _, _| 0.0,
         uniform_fraction: 0.25,
         cost_ratio: 1.3,
         refine: false,
@@ -104,7 +105,7 @@ static REGISTRY: &[GuideSpec] = &[
         defaults: || Kind::Direction.defaults(),
         validate: |o| Kind::Direction.validate(o),
         seconds_per_path: |_, _| 0.0,
-        seconds: |_, _| 0.0,
+        seconds: |_, _, _| 0.0,
         uniform_fraction: 0.1,
         cost_ratio: 0.5,
         refine: true,
@@ -118,7 +119,7 @@ static REGISTRY: &[GuideSpec] = &[
         defaults: || Kind::Emitter.defaults(),
         validate: |o| Kind::Emitter.validate(o),
         seconds_per_path: |_, _| 0.0,
-        seconds: |_, _| 0.0,
+        seconds: |_, _, _| 0.0,
         uniform_fraction: 0.1,
         cost_ratio: 0.1,
         refine: true,
@@ -132,7 +133,7 @@ static REGISTRY: &[GuideSpec] = &[
         defaults: || Kind::Light.defaults(),
         validate: |o| Kind::Light.validate(o),
         seconds_per_path: |_, _| 0.0,
-        seconds: |_, _| 0.0,
+        seconds: |_, _, _| 0.0,
         uniform_fraction: 0.1,
         cost_ratio: 0.25,
         refine: true,
@@ -146,7 +147,7 @@ static REGISTRY: &[GuideSpec] = &[
         defaults: || Net::Mixture.defaults(),
         validate: |o| Net::Mixture.validate(o),
         seconds_per_path: |_, d| Net::seconds_per_path(d),
-        seconds: |o, d| Net::Mixture.seconds(o, d),
+        seconds: |o, d, n| Net::Mixture.seconds(o, d, n),
         uniform_fraction: 0.25,
         cost_ratio: 0.6,
         refine: true,

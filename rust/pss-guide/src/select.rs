@@ -28,7 +28,7 @@ const AS_GOOD: f64 = 0.98;
 /// of them.
 const MOST_TRAINING: f64 = 0.1;
 
-/// The same where it costs as much however few the paths: it is paid once to look, and again to use what was found.
+/// The same where it costs about as much for few paths: it is paid once to look, and again to use what was found.
 const MOST_FIXED_TRAINING: f64 = 0.025;
 
 /// Light-carrying paths that are looked at, at most: more would tell little, and the choice must not cost more than it
@@ -297,13 +297,13 @@ fn seconds_left(remaining: &Remaining) -> f64 {
 fn affordable(recipe: &Recipe, records: &Records<'_>, remaining: &Remaining) -> bool {
     let left = seconds_left(remaining);
     let growing = recipe.seconds_per_path(records.dims) * records.f.len() as f64;
-    let fixed = fixed_seconds(recipe, records, remaining);
+    let fixed = fixed_seconds(recipe, records.dims, records.f.len(), remaining);
     growing <= MOST_TRAINING * left && fixed <= MOST_FIXED_TRAINING * left
 }
 
-/// Seconds on all threads that training takes however many paths there are.
-fn fixed_seconds(recipe: &Recipe, records: &Records<'_>, remaining: &Remaining) -> f64 {
-    recipe.seconds(records.dims) / remaining.threads.max(1) as f64
+/// Seconds on all threads of the part of training on `rows` paths that does not grow with them.
+fn fixed_seconds(recipe: &Recipe, dims: usize, rows: usize, remaining: &Remaining) -> f64 {
+    recipe.seconds(dims, rows) / remaining.threads.max(1) as f64
 }
 
 /// Share of the time that is left that fitting to all paths takes, `growth` times those that it was tried on: measured
@@ -315,15 +315,14 @@ fn training_share(
     seconds: f64,
     remaining: &Remaining,
 ) -> f64 {
-    let fixed = fixed_seconds(recipe, fitted_to, remaining);
+    let (dims, tried) = (fitted_to.dims, fitted_to.f.len());
+    let all = (growth * tried as f64) as usize;
+    let [small, large] = [tried, all].map(|rows| fixed_seconds(recipe, dims, rows, remaining));
     let training = match remaining.seconds_per_path {
-        // Which part of a measured time grows is not known; where there is a fixed one, it is by far the larger.
-        Some(_) if fixed > 0.0 => seconds,
+        // Which part of a measured time grows is not known; where another is expected, it is by far the larger.
+        Some(_) if small > 0.0 => seconds * large / small,
         Some(_) => growth * seconds,
-        None => {
-            let growing = recipe.seconds_per_path(fitted_to.dims) * fitted_to.f.len() as f64;
-            growth * growing + fixed
-        }
+        None => recipe.seconds_per_path(dims) * all as f64 + large,
     };
     (training / seconds_left(remaining).max(f64::MIN_POSITIVE)).min(1.0)
 }

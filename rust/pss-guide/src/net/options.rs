@@ -6,17 +6,17 @@ use serde_json::{Map, Value};
 use super::Kind;
 use crate::{GuideError, options};
 
-/// Rows that training looks at where nothing else is asked for: about a thousand steps.
+/// Rows that training looks at where nothing else is asked for: four thousand steps.
 const USUAL_ROWS: usize = 1 << 21;
 
 /// Most epochs that are made of few paths.
-const MOST_EPOCHS: usize = 32;
+const MOST_EPOCHS: usize = 64;
 
 /// Options of `mixture-net`, and of `spline-net` but for the components, in place of which it has `bins`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct MixtureNetOptions {
-    /// Normals of the mixture, 1 … 64. (Default: 6)
+    /// Normals of the mixture, 1 … 64. (Default: 8)
     pub components: usize,
     /// Units of a hidden layer, 1 … 512. (Default: 32)
     pub hidden: usize,
@@ -24,9 +24,9 @@ pub struct MixtureNetOptions {
     pub layers: usize,
     /// First step of Adam, in (0, 1]; it falls to 0 as half a cosine. (Default: 5e-3)
     pub learning_rate: f64,
-    /// Paths per step, 1 … 65,536. (Default: 2048)
+    /// Paths per step, 1 … 65,536. (Default: 512)
     pub batch: usize,
-    /// Passes over the paths, 1 … 10,000; `null`: as many as show the network 2²¹ paths, at most 32.
+    /// Passes over the paths, 1 … 10,000; `null`: as many as show the network 2²¹ paths, at most 64.
     pub epochs: Option<usize>,
     /// Paths that are trained with, 2 … 2²⁴; of more, evenly spaced ones are taken. (Default: 524,288)
     pub max_rows: usize,
@@ -40,11 +40,11 @@ pub struct MixtureNetOptions {
 impl Default for MixtureNetOptions {
     fn default() -> Self {
         Self {
-            components: 6,
+            components: 8,
             hidden: 32,
             layers: 2,
             learning_rate: 5e-3,
-            batch: 2048,
+            batch: 512,
             epochs: None,
             max_rows: 524_288,
             loss_fraction: 0.1,
@@ -119,10 +119,9 @@ impl MixtureNetOptions {
         self.epochs.unwrap_or(usual)
     }
 
-    /// Most paths, with repetitions, that a training sees.
-    pub(super) fn most_seen(&self) -> usize {
-        self.epochs.map_or(USUAL_ROWS + self.max_rows, |e| {
-            e.saturating_mul(self.max_rows)
-        })
+    /// Paths, with repetitions, that a training on `rows` sees.
+    pub(super) fn seen(&self, rows: usize) -> usize {
+        let rows = rows.min(self.max_rows);
+        self.epochs(rows).saturating_mul(rows)
     }
 }
