@@ -91,7 +91,7 @@ static REGISTRY: &[GuideSpec] = &[
         defaults: || options::to_map(&VegasOptions::default()),
         validate: |o| VegasOptions::parse(o).map(drop),
         seconds_per_path: |_, _| 0.0,
-        seconds: |_, _| 0.0,
+        seconds: |_, _, _| 0.0,
         uniform_fraction: 0.1,
         cost_ratio: 0.5,
         refine: true,
