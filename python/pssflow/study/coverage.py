@@ -123,7 +123,7 @@ def examine(plan: Plan, effort: float, rounds: int, threads: int) -> dict[str, A
     found: dict[str, Any] = {
         "timings": first.timings,
         "peak_bytes": _peak() - idle,
-        "array_bytes": sum(array.nbytes for array in first.exported.arrays),
+        "held_bytes": sum(first.summary[f"{what}_bytes"] for what in ("geometry", "texture", "bvh")),
         "triangles": first.summary["triangles"],
         "features": features(first),
         "notes": first.notes,
@@ -285,8 +285,8 @@ Random sampling (strategy `mis`) beside Mitsuba's truth, the difference of two d
 of Welch's test of the image means and of the tiles (12², Holm's correction); below {alpha:g} the two differ. Films are
 reduced to {side} pixels. Nothing is clipped. A tile whose largest sample holds more than a tenth of its sum is tested
 as part of a tile of 24² or 48²; where that does not help it has no power, and is counted for k = 1, 2, 3. Loads:
-Mitsuba + export + BVH, in `scalar_rgb`; memory: the arrays of the export / the growth of the process' peak over all of
-loading. Shares are of the light that is not directly visible emission."""
+Mitsuba + export + BVH, in `scalar_rgb`; memory: arrays and BVH that are held / the growth of the process' peak over all
+of loading, Mitsuba's own copy with it. Shares are of the light that is not directly visible emission."""
 
 _SPEEDS = """\
 Million paths per second on {threads} thread(s), medians of {rounds} interleaved rounds; ratios are medians of the
@@ -343,7 +343,7 @@ def _mean_row(row: Mapping[str, Any]) -> list[str]:
         row["scene"],
         f"{row['triangles']:,}",
         f"{t['load']:.1f} + {t['export']:.1f} + {t['bvh']:.1f}",
-        f"{row['array_bytes'] / 1e6:.0f} / {row['peak_bytes'] / 1e6:.0f}",
+        f"{row['held_bytes'] / 1e6:.0f} / {row['peak_bytes'] / 1e6:.0f}",
         *(_p(by_k[k]["p"]) for k in BOUNCES),
         "–" if ratio is None else f"{ratio:.4f} ± {by_k[2]['ratio_se']:.4f}",
         " ".join(str(by_k[k]["without_power"]) for k in BOUNCES) + f" of {by_k[2]['tiles']}",
