@@ -58,8 +58,13 @@ def run(command: list[str], folder: Path) -> str:
     return result.stdout
 
 
-def test_commands_of_all_three_kinds_are_shown() -> None:
-    assert {shlex.split(command)[1] for command in COMMANDS} == {"info", "render", "compare"}
+def test_a_command_of_each_kind_is_shown() -> None:
+    assert {shlex.split(command)[1] for command in COMMANDS} == {
+        "info",
+        "render",
+        "compare",
+        "inspect",
+    }
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda command: shlex.split(command)[1])
@@ -74,8 +79,8 @@ def test_a_command_works_as_it_stands(command: str, clone: Path) -> None:
 
 def test_options_in_the_text_exist() -> None:
     helps = "".join(
-        run([sys.executable, "-m", "pssflow", name, "--help"], ROOT)
-        for name in ("info", "render", "compare")
+        run([sys.executable, "-m", "pssflow", *name.split(), "--help"], ROOT)
+        for name in ("info", "render", "compare", "inspect", "study guides")
     )
     named = set(re.findall(r"`(--[a-z-]+)", README))
     assert named
