@@ -53,6 +53,7 @@ def test_make_help_lists_every_target() -> None:
             "lint",
             "bench",
             "coverage",
+            "study-guides",
             "docs",
             "clean",
         )

@@ -93,7 +93,7 @@ def test_coverage(llvm_variant, tmp_path, monkeypatch, capfd):
 def test_a_scene_that_fails_is_one_row():
     """Neither the table nor the sums stumble over it, or over what could not be tested."""
     test = {"p": None, "tiles": 12, "without_power": 12, "ratio": None, "ratio_se": None}
-    row = {"scene": "dark", "triangles": 1, "array_bytes": 1, "peak_bytes": 1, "shares": {}}
+    row = {"scene": "dark", "triangles": 1, "held_bytes": 1, "peak_bytes": 1, "shares": {}}
     row |= {"timings": {"load": 0, "export": 0, "bvh": 0}, "parity": dict.fromkeys("123", test)}
     row |= {"speed": {"ours": 1e6, "rays": 2e6}, "features": {key: {"area": 2} for key in KINDS}}
     state = {"effort": 1.0, "rounds": 1, "threads": 1, "commit": "abc", "command": "x"}

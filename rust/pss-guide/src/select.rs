@@ -94,6 +94,9 @@ pub struct Selection {
 
 /// The candidates of `auto`; every subset of a composite's factors is meant, too.
 ///
+/// `mixture-net` is none yet: what the held-out paths promise of it does not hold where few of them carry light
+/// (ARCHITECTURE.md).
+///
 /// # Errors
 /// None that the registry of this build does not cause.
 pub fn candidates() -> Result<Vec<Recipe>, GuideError> {
@@ -106,7 +109,6 @@ pub fn candidates() -> Result<Vec<Recipe>, GuideError> {
     Ok(vec![
         Recipe::parse("table", &Map::new())?,
         Recipe::parse("table", &stiff)?,
-        Recipe::parse("mixture-net+emitter-table+light-table", &Map::new())?,
     ])
 }
 
