@@ -123,7 +123,9 @@ def examine(plan: Plan, effort: float, rounds: int, threads: int) -> dict[str, A
     found: dict[str, Any] = {
         "timings": first.timings,
         "peak_bytes": _peak() - idle,
-        "held_bytes": sum(first.summary[f"{what}_bytes"] for what in ("geometry", "texture", "bvh")),
+        "held_bytes": sum(
+            first.summary[f"{what}_bytes"] for what in ("geometry", "texture", "bvh")
+        ),
         "triangles": first.summary["triangles"],
         "features": features(first),
         "notes": first.notes,
