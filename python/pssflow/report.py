@@ -21,6 +21,7 @@ __all__ = [
     "compare_picture",
     "count",
     "gain",
+    "markdown_table",
     "number",
     "panel",
     "percent",
@@ -247,3 +248,11 @@ def percent(share: float | None) -> str:
 
 def _option(value: Any) -> str:
     return "null" if value is None else str(value)
+
+
+def markdown_table(
+    headings: Sequence[str], rows: Sequence[Sequence[str]], *, texts: int = 1
+) -> str:
+    """A table in Markdown, whose first `texts` columns are words and the others numbers."""
+    lines = [headings, [*["---"] * texts, *["--:"] * (len(headings) - texts)], *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)

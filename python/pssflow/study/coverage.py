@@ -29,6 +29,7 @@ import numpy as np
 
 from ..files import first_line, write_beside
 from ..output import make_folder, write_json
+from ..report import markdown_table
 from ..scene import Scene
 from ..terminal import Terminal, run_command
 from . import parity
@@ -71,7 +72,7 @@ def coverage(
     one: str | None,
 ) -> None:
     """Compares all scenes with Mitsuba, by mean and by speed; writes a Markdown table."""
-    plans = {plan.name: plan for plan in all_plans()}
+    plans = {plan.name: plan for plan in parity.all_plans()}
     settings = {"effort": effort, "rounds": rounds, "threads": threads, "commit": commit()}
     folder = make_folder(work)
     if one is not None:
@@ -104,14 +105,6 @@ def coverage(
         text = document(rows, settings | state)
         write_beside(Path(output), lambda part, text=text: part.write_text(text, encoding="utf-8"))
     terminal.out.print(f"wrote {output}", highlight=False)
-
-
-def all_plans() -> list[Plan]:
-    """The project's own scenes, and the third-party ones that are there; of one name, the first."""
-    shared = parity.shared_folder()
-    plans = parity.shared_plans(shared) if shared else []
-    own = [replace(plan, name=f"scenes/{plan.name}") for plan in parity.own_plans()]
-    return own + plans
 
 
 def examine(plan: Plan, effort: float, rounds: int, threads: int) -> dict[str, Any]:
@@ -268,14 +261,14 @@ def document(rows: Sequence[Mapping[str, Any]], state: Mapping[str, Any]) -> str
         _header(state),
         "## The same light",
         _MEANS.format(alpha=ALPHA / 2, side=SIDE),
-        _table(_MEAN_HEADINGS, [_mean_row(row) for row in rows]),
+        markdown_table(_MEAN_HEADINGS, [_mean_row(row) for row in rows]),
         _verdicts(done),
         "## At what speed",
         _SPEEDS.format(k=K, depth=K + 1, side=TIMED_SIDE, spp=TIMED_SPP, **state),
-        _table(_SPEED_HEADINGS, [_speed_row(row) for row in done]),
+        markdown_table(_SPEED_HEADINGS, [_speed_row(row) for row in done]),
         _targets(done),
         "## What is in them",
-        _table(["scene", *KINDS], [_feature_row(row) for row in done]),
+        markdown_table(["scene", *KINDS], [_feature_row(row) for row in done]),
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -328,11 +321,6 @@ def _cpu_flags() -> str:
     line = next((line for line in text.splitlines() if line.startswith("flags")), "")
     known = ("sse4_2", "avx", "avx2", "fma", "avx512f", "avx512bw", "avx512vl")
     return ", ".join(flag for flag in known if flag in line.split()) or "flags unknown"
-
-
-def _table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [headings, ["---", *["--:"] * (len(headings) - 1)], *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def _mean_row(row: Mapping[str, Any]) -> list[str]:

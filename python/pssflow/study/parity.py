@@ -9,7 +9,7 @@ and those that remain are counted (`welch_where_power`).
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -90,6 +90,13 @@ def shared_folder() -> Path | None:
     """What the environment variable PSSFLOW_SCENES names, if it is a folder."""
     folder = os.environ.get("PSSFLOW_SCENES")
     return Path(folder) if folder and Path(folder).is_dir() else None
+
+
+def all_plans() -> list[Plan]:
+    """The project's own scenes, under `scenes/`, and the third-party ones that are there, with all their cameras."""
+    shared = shared_folder()
+    own = [replace(plan, name=f"scenes/{plan.name}") for plan in own_plans()]
+    return own + (shared_plans(shared) if shared else [])
 
 
 def load(plan: Plan, side: int = SIDE) -> Scene:

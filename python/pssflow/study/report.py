@@ -11,7 +11,7 @@ from rich.table import Table
 
 from ..files import write_beside
 from ..metrics import Estimate
-from ..report import number, scene_title
+from ..report import markdown_table, number, scene_title
 from .charts import error_chart, ratio_chart
 from .harness import Study
 from .store import Row
@@ -89,9 +89,9 @@ def publish(study: Study, rows: Sequence[Row], title: str) -> list[Any]:
     text = "\n\n".join(
         [
             f"# {title[0].upper()}{title[1:]}",
-            _markdown(HEADINGS, table),
+            markdown_table(HEADINGS, table, texts=2),
             NOTES,
-            *([_markdown(sum_headings, sums)] if sums else []),
+            *([markdown_table(sum_headings, sums, texts=2)] if sums else []),
             *lines,
         ]
     )
@@ -225,8 +225,3 @@ def _rich(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
     for row in rows:
         table.add_row(*row)
     return table
-
-
-def _markdown(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [headings, ["---", "---", *["--:"] * (len(headings) - 2)], *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)

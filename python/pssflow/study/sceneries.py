@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,10 +26,7 @@ SIX = (
 
 def every_scene() -> list[Plan]:
     """The project's own scenes, and the third-party ones that are there (one camera each)."""
-    shared = parity.shared_folder()
-    plans = parity.shared_plans(shared) if shared else []
-    own = [replace(plan, name=f"scenes/{plan.name}") for plan in parity.own_plans()]
-    return own + [plan for plan in plans if "_cam" not in plan.name]
+    return [plan for plan in parity.all_plans() if "_cam" not in plan.name]
 
 
 def named_scenes(names: Sequence[str]) -> list[Plan]:
@@ -40,9 +36,7 @@ def named_scenes(names: Sequence[str]) -> list[Plan]:
         FileNotFoundError: there is no such scene.
         ValueError: one was named twice.
     """
-    shared = parity.shared_folder()
-    known = {plan.name: plan for plan in every_scene()}
-    known |= {plan.name: plan for plan in parity.shared_plans(shared)} if shared else {}
+    known = {plan.name: plan for plan in parity.all_plans()}
     plans = []
     for name in names:
         alternatives = [part.removesuffix("/scene.xml").rstrip("/") for part in name.split("|")]

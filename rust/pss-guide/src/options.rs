@@ -44,6 +44,35 @@ pub(crate) fn to_map<T: Serialize>(options: &T) -> Map<String, Value> {
     }
 }
 
+/// What a guide's options must keep to; the error names the option, its value and the rule.
+pub(crate) struct Rules<'a> {
+    guide: &'a str,
+    values: Map<String, Value>,
+}
+
+impl<'a> Rules<'a> {
+    pub(crate) fn new<T: Serialize>(guide: &'a str, options: &T) -> Self {
+        Self {
+            guide,
+            values: to_map(options),
+        }
+    }
+
+    /// An error unless `option` is accepted.
+    pub(crate) fn check(&self, option: &str, accepted: bool, rule: &str) -> Result<(), GuideError> {
+        if accepted {
+            return Ok(());
+        }
+        let value = self.values.get(option).unwrap_or(&Value::Null);
+        Err(bad(self.guide, option, value, rule))
+    }
+}
+
+/// Whether `x` lies in (0, `most`].
+pub(crate) fn positive(x: f64, most: f64) -> bool {
+    x > 0.0 && x <= most
+}
+
 /// The error for `option`.
 pub(crate) fn bad(guide: &str, option: &str, value: &Value, rule: &str) -> GuideError {
     GuideError::Option {

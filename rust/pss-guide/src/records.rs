@@ -76,6 +76,11 @@ impl Terms {
         2.0 * self.f_nee * self.f_bsdf / self.g + self.f_bsdf * self.f_bsdf / self.g_bsdf
     }
 
+    /// Estimate of ∫f².
+    pub(crate) fn square(&self) -> f64 {
+        self.nee_square() + self.bsdf_square()
+    }
+
     /// Estimate of ∫f.
     pub(crate) fn value(&self) -> f64 {
         self.f_nee / self.g + self.f_bsdf / self.g_bsdf
@@ -290,6 +295,36 @@ impl Usable {
                 self.rows[at.min(self.rows.len() - 1)]
             })
             .collect()
+    }
+}
+
+/// Rows with their weights in training, none of which counts more than a quantile of all.
+#[derive(Debug)]
+pub(crate) struct Clipped {
+    /// Rows and weights in (0, `limit`].
+    pub(crate) rows: Vec<(usize, f64)>,
+    /// The quantile; 1 where there is no row.
+    pub(crate) limit: f64,
+    /// Rows that weighed more.
+    pub(crate) count: usize,
+}
+
+impl Clipped {
+    /// Of `rows` those whose weight is positive and finite.
+    pub(crate) fn new(
+        rows: impl Iterator<Item = usize>,
+        weight: impl Fn(usize) -> f64,
+        clip: f64,
+    ) -> Self {
+        let mut rows: Vec<(usize, f64)> = rows.map(|row| (row, weight(row))).collect();
+        rows.retain(|r| r.1 > 0.0 && r.1.is_finite());
+        let limit = quantile(rows.iter().map(|r| r.1), clip).unwrap_or(1.0);
+        let mut count = 0;
+        for (_, weight) in rows.iter_mut().filter(|r| r.1 > limit) {
+            *weight = limit;
+            count += 1;
+        }
+        Self { rows, limit, count }
     }
 }
 

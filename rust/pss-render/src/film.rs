@@ -45,7 +45,6 @@ pub struct Film {
 /// reaches, so that one look-up and one interpolation give them all.
 #[derive(Clone, Debug)]
 struct Filter {
-    radius: f32,
     /// Pixels that a sample reaches on either side of its own.
     reach: usize,
     /// `STEPS + 1` rows of `2 · reach + 1` weights.
@@ -68,13 +67,12 @@ impl Filter {
             let i = (t as usize).min(table.len() - 2);
             table[i] + (table[i + 1] - table[i]) * (t - i as f32)
         };
-        let reach = (radius + 0.5) as usize;
+        let reach = (radius - 0.5).ceil().max(0.0) as usize;
         let rows = (0..=Self::STEPS).flat_map(|step| {
             let x = step as f32 / Self::STEPS as f32;
             (0..=2 * reach).map(move |i| i as f32 - reach as f32 + 0.5 - x)
         });
         Self {
-            radius,
             reach,
             rows: rows.map(eval).collect(),
         }
@@ -198,9 +196,7 @@ impl Film {
 
     /// Pixels beyond a tile's edge that its samples reach.
     pub fn border(&self) -> u32 {
-        self.filter
-            .as_ref()
-            .map_or(0, |f| (f.radius - 0.5).ceil().max(0.0) as u32)
+        self.filter.as_ref().map_or(0, |f| f.reach as u32)
     }
 }
 

@@ -76,13 +76,11 @@ impl RayLog {
     pub fn replay(&self, accel: &embree4::Scene) -> u64 {
         let mut met = 0;
         let mut hits: [Option<Hit>; PACKET_WIDTH] = [None; PACKET_WIDTH];
-        for rays in self.camera.chunks(PACKET_WIDTH) {
-            accel.intersect_packet16(rays, &mut hits[..rays.len()], true);
-            met += hits[..rays.len()].iter().flatten().count() as u64;
-        }
-        for rays in self.next.chunks(PACKET_WIDTH) {
-            accel.intersect_packet16(rays, &mut hits[..rays.len()], false);
-            met += hits[..rays.len()].iter().flatten().count() as u64;
+        for (rays, coherent) in [(&self.camera, true), (&self.next, false)] {
+            for rays in rays.chunks(PACKET_WIDTH) {
+                accel.intersect_packet16(rays, &mut hits[..rays.len()], coherent);
+                met += hits[..rays.len()].iter().flatten().count() as u64;
+            }
         }
         let mut blocked = [false; PACKET_WIDTH];
         for rays in self.shadow.chunks(PACKET_WIDTH) {

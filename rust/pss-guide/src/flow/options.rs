@@ -79,51 +79,47 @@ impl RealNvpOptions {
     }
 
     fn check(&self, domain: Domain) -> Result<(), GuideError> {
-        let map = options::to_map(self);
-        let rule = |option: &str, accepted: bool, rule: &str| {
-            if accepted {
-                return Ok(());
-            }
-            let value = map.get(option).cloned().unwrap_or(Value::Null);
-            Err(options::bad(domain.name(), option, &value, rule))
-        };
-        let positive = |x: f64, most: f64| x > 0.0 && x <= most;
-        rule(
+        let rules = options::Rules::new(domain.name(), self);
+        rules.check(
             "couplings",
             (1..=64).contains(&self.couplings),
             "1 to 64 couplings",
         )?;
-        rule("hidden", (1..=512).contains(&self.hidden), "1 to 512 units")?;
-        rule(
+        rules.check("hidden", (1..=512).contains(&self.hidden), "1 to 512 units")?;
+        rules.check(
             "layers",
             (1..=8).contains(&self.layers),
             "1 to 8 hidden layers",
         )?;
-        rule("s_max", positive(self.s_max, 16.0), "a number in (0, 16]")?;
-        rule(
+        rules.check(
+            "s_max",
+            options::positive(self.s_max, 16.0),
+            "a number in (0, 16]",
+        )?;
+        rules.check(
             "learning_rate",
-            positive(self.learning_rate, 1.0),
+            options::positive(self.learning_rate, 1.0),
             "a number in (0, 1]",
         )?;
-        rule(
+        rules.check(
             "batch",
             (1..=65_536).contains(&self.batch),
             "1 to 65536 rows",
         )?;
-        rule(
+        rules.check(
             "epochs",
             (1..=10_000).contains(&self.epochs),
             "1 to 10000 epochs",
         )?;
         let samples = self.samples.unwrap_or(DEFAULT_SAMPLES);
-        rule(
+        rules.check(
             "samples",
             (2..=1 << 24).contains(&samples),
             "2 to 16777216 rows, or null",
         )?;
-        rule(
+        rules.check(
             "outlier_quantile",
-            positive(self.outlier_quantile, 1.0),
+            options::positive(self.outlier_quantile, 1.0),
             "a number in (0, 1]",
         )
     }

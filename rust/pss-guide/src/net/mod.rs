@@ -27,7 +27,7 @@ use self::options::MixtureNetOptions;
 use self::train::Data;
 use crate::file::{self, Contents};
 use crate::predict::HeldOut;
-use crate::records::quantile;
+use crate::records::Clipped;
 use crate::{Context, Decision, Fit, Guide, GuideError, Records, options as json_options};
 
 /// Seconds on one core that a decision, forward and back, takes with the default network, as `examples/guide_cost.rs` shows.
@@ -306,21 +306,15 @@ impl Weighted {
         let weight = |row: usize| {
             let terms = records.terms(row);
             let relative = tiles.as_ref().map_or(1.0, |t| t.weight(row));
-            (terms.nee_square() + terms.bsdf_square()) * relative
+            terms.square() * relative
         };
-        let rows = usable.iter().step_by(stride);
-        let mut rows: Vec<(usize, f64)> = rows.map(|&row| (row, weight(row))).collect();
-        rows.retain(|r| r.1 > 0.0 && r.1.is_finite());
-        let limit = quantile(rows.iter().map(|r| r.1), options.clip_quantile).unwrap_or(1.0);
-        let clipped = rows.iter().filter(|r| r.1 > limit).count();
-        let mean = rows.iter().map(|r| r.1.min(limit)).sum::<f64>() / rows.len().max(1) as f64;
+        let rows = usable.iter().step_by(stride).copied();
+        let Clipped { rows, count, .. } = Clipped::new(rows, weight, options.clip_quantile);
+        let mean = rows.iter().map(|r| r.1).sum::<f64>() / rows.len().max(1) as f64;
         Self {
-            weights: rows
-                .iter()
-                .map(|r| (r.1.min(limit) / mean) as f32)
-                .collect(),
+            weights: rows.iter().map(|r| (r.1 / mean) as f32).collect(),
             paths: rows.into_iter().map(|r| r.0).collect(),
-            clipped,
+            clipped: count,
         }
     }
 

@@ -1,4 +1,4 @@
-//! Options of the nets.
+//! Options of the net.
 
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
@@ -12,7 +12,7 @@ const USUAL_ROWS: usize = 1 << 21;
 /// Most epochs that are made of few paths.
 const MOST_EPOCHS: usize = 64;
 
-/// Options of `mixture-net`, and of `spline-net` but for the components, in place of which it has `bins`.
+/// Options of `mixture-net`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct MixtureNetOptions {
@@ -60,54 +60,46 @@ impl MixtureNetOptions {
     }
 
     fn checked(self, guide: &str) -> Result<Self, GuideError> {
-        let map = options::to_map(&self);
-        let rule = |option: &str, accepted: bool, rule: &str| {
-            if accepted {
-                return Ok(());
-            }
-            let value = map.get(option).cloned().unwrap_or(Value::Null);
-            Err(options::bad(guide, option, &value, rule))
-        };
-        let share = |x: f64| x > 0.0 && x <= 1.0;
-        rule(
+        let rules = options::Rules::new(guide, &self);
+        rules.check(
             "components",
             (1..=64).contains(&self.components),
             "1 to 64 components",
         )?;
-        rule("hidden", (1..=512).contains(&self.hidden), "1 to 512 units")?;
-        rule(
+        rules.check("hidden", (1..=512).contains(&self.hidden), "1 to 512 units")?;
+        rules.check(
             "layers",
             (1..=8).contains(&self.layers),
             "1 to 8 hidden layers",
         )?;
-        rule(
+        rules.check(
             "learning_rate",
-            share(self.learning_rate),
+            options::positive(self.learning_rate, 1.0),
             "a number in (0, 1]",
         )?;
-        rule(
+        rules.check(
             "batch",
             (1..=65_536).contains(&self.batch),
             "1 to 65536 paths",
         )?;
-        rule(
+        rules.check(
             "epochs",
             self.epochs.is_none_or(|e| (1..=10_000).contains(&e)),
             "1 to 10000 epochs, or null",
         )?;
-        rule(
+        rules.check(
             "max_rows",
             (2..=1 << 24).contains(&self.max_rows),
             "2 to 16777216 paths",
         )?;
-        rule(
+        rules.check(
             "loss_fraction",
-            share(self.loss_fraction),
+            options::positive(self.loss_fraction, 1.0),
             "a number in (0, 1]",
         )?;
-        rule(
+        rules.check(
             "clip_quantile",
-            share(self.clip_quantile),
+            options::positive(self.clip_quantile, 1.0),
             "a number in (0, 1]",
         )?;
         Ok(self)

@@ -23,7 +23,7 @@ use self::line::{Line, Lines};
 use self::options::{EmitterTableOptions, TableOptions};
 use self::square::Square;
 use crate::file::Contents;
-use crate::records::quantile;
+use crate::records::Clipped;
 use crate::{Context, Decision, Fit, Guide, GuideError, Records, options as json_options};
 
 /// Most bins on an area light: its image in the two numbers has few details.
@@ -436,19 +436,16 @@ impl Weighted {
         let weight = |row: usize| {
             let terms = records.terms(row);
             match kind {
-                Kind::Direction => terms.nee_square() + terms.bsdf_square(),
+                Kind::Direction => terms.square(),
                 Kind::Emitter | Kind::Light => terms.nee_square(),
             }
         };
-        let mut rows: Vec<(usize, f64)> = usable.iter().map(|&r| (r, weight(r))).collect();
-        rows.retain(|r| r.1 > 0.0 && r.1.is_finite());
-        let limit = quantile(rows.iter().map(|r| r.1), clip).unwrap_or(1.0);
-        let clipped = rows.iter().filter(|r| r.1 > limit).count();
+        let clipped = Clipped::new(usable.iter().copied(), weight, clip);
         let share =
-            |(row, w): (usize, f64)| (row, ((w / limit).min(1.0) as f32).max(f32::MIN_POSITIVE));
+            |&(row, w): &(usize, f64)| (row, ((w / clipped.limit) as f32).max(f32::MIN_POSITIVE));
         Self {
-            rows: rows.into_iter().map(share).collect(),
-            clipped,
+            rows: clipped.rows.iter().map(share).collect(),
+            clipped: clipped.count,
         }
     }
 

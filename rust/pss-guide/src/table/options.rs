@@ -75,38 +75,30 @@ impl TableOptions {
     }
 
     fn checked(self, guide: &str) -> Result<Self, GuideError> {
-        let map = options::to_map(&self);
-        let rule = |option: &str, accepted: bool, rule: &str| {
-            if accepted {
-                return Ok(());
-            }
-            let value = map.get(option).cloned().unwrap_or(Value::Null);
-            Err(options::bad(guide, option, &value, rule))
-        };
-        let within = |x: f64, most: f64| x > 0.0 && x <= most;
-        rule(
+        let rules = options::Rules::new(guide, &self);
+        rules.check(
             "kappa",
-            self.kappa.is_none_or(|k| within(k, 1e6)),
+            self.kappa.is_none_or(|k| options::positive(k, 1e6)),
             "a number in (0, 1000000], or null",
         )?;
-        rule(
+        rules.check(
             "bins",
             self.bins.is_none_or(|b| Square::BINS.contains(&b)),
             "4, 8, 16, 32 or null",
         )?;
-        rule(
+        rules.check(
             "depth",
             self.depth.is_none_or(|d| d <= MOST_DEPTH),
             "0 to 6, or null",
         )?;
-        rule(
+        rules.check(
             "memory_mib",
             (1..=65_536).contains(&self.memory_mib),
             "1 to 65536 MiB",
         )?;
-        rule(
+        rules.check(
             "clip_quantile",
-            within(self.clip_quantile, 1.0),
+            options::positive(self.clip_quantile, 1.0),
             "a number in (0, 1]",
         )?;
         Ok(self)

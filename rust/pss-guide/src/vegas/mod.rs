@@ -16,7 +16,7 @@ use self::fit::Row;
 use self::grid::Grid;
 use self::options::VegasOptions;
 use crate::file::{self, Contents};
-use crate::records::quantile;
+use crate::records::Clipped;
 use crate::{Context, Decision, Fit, Guide, GuideError, Records, options as json_options};
 
 /// Name in the registry.
@@ -54,26 +54,15 @@ impl Vegas {
         stage(0.0)?;
         let usable = records.usable(1.0)?;
         stage(0.1)?;
-        let mut weighted: Vec<(usize, f64)> = usable
-            .rows
-            .iter()
-            .map(|&path| {
-                let terms = records.terms(path);
-                (path, terms.nee_square() + terms.bsdf_square())
-            })
-            .collect();
-        weighted.retain(|(_, w)| w.is_finite() && *w > 0.0);
-        let limit = quantile(weighted.iter().map(|r| r.1), options.clip_quantile).unwrap_or(1.0);
-        let clipped = weighted.iter().filter(|r| r.1 > limit).count();
+        let square = |path: usize| records.terms(path).square();
+        let weighted = Clipped::new(usable.rows.iter().copied(), square, options.clip_quantile);
         let empty = Grid::uniform(records.dims, options.bins, options.side());
-        let mut rows: Vec<Row> = weighted
-            .into_iter()
-            .map(|(path, w)| Row {
-                path,
-                tile: empty.tile(&records.pixel(path)),
-                weight: (w / limit).min(1.0),
-            })
-            .collect();
+        let row = |&(path, w): &(usize, f64)| Row {
+            path,
+            tile: empty.tile(&records.pixel(path)),
+            weight: w / weighted.limit,
+        };
+        let mut rows: Vec<Row> = weighted.rows.iter().map(row).collect();
         let mut rest = |done: f32| progress(0.2 + 0.79 * done);
         let grid = fit::fit(&options, records, &mut rows, &mut rest);
         let grid = grid.ok_or(GuideError::Cancelled)?;
@@ -84,7 +73,7 @@ impl Vegas {
                 facts: json!({
                     "options": json_options::to_map(&options),
                     "paths": records.paths(),
-                    "clipped": clipped,
+                    "clipped": weighted.count,
                 }),
             }),
             history: Vec::new(),

@@ -55,31 +55,27 @@ impl VegasOptions {
     /// `given` over the defaults, checked.
     pub(crate) fn parse(given: &Map<String, Value>) -> Result<Self, GuideError> {
         let parsed = options::parse(NAME, &Self::default(), given)?;
-        let map = options::to_map(&parsed);
-        let rule = |option: &str, accepted: bool, rule: &str| {
-            if accepted {
-                return Ok(());
-            }
-            let value = map.get(option).cloned().unwrap_or(Value::Null);
-            Err(options::bad(NAME, option, &value, rule))
-        };
-        let within = |x: f64, most: f64| x > 0.0 && x <= most;
-        rule("bins", (2..=256).contains(&parsed.bins), "2 to 256 bins")?;
-        rule("damping", within(parsed.damping, 4.0), "a number in (0, 4]")?;
-        rule(
+        let rules = options::Rules::new(NAME, &parsed);
+        rules.check("bins", (2..=256).contains(&parsed.bins), "2 to 256 bins")?;
+        rules.check(
+            "damping",
+            options::positive(parsed.damping, 4.0),
+            "a number in (0, 4]",
+        )?;
+        rules.check(
             "iterations",
             (1..=100).contains(&parsed.iterations),
             "1 to 100 iterations",
         )?;
-        rule("tiles", (1..=64).contains(&parsed.tiles), "1 to 64 tiles")?;
-        rule(
+        rules.check("tiles", (1..=64).contains(&parsed.tiles), "1 to 64 tiles")?;
+        rules.check(
             "kappa",
-            within(parsed.kappa, 1e6),
+            options::positive(parsed.kappa, 1e6),
             "a number in (0, 1000000]",
         )?;
-        rule(
+        rules.check(
             "clip_quantile",
-            within(parsed.clip_quantile, 1.0),
+            options::positive(parsed.clip_quantile, 1.0),
             "a number in (0, 1]",
         )?;
         Ok(parsed)
