@@ -1,8 +1,8 @@
 """Fails when fewer tests ran than `count.txt` says: a suite that silently shrinks looks as green as a full one.
 
-    python tests/check_count.py python-quick=out/tests/python.xml rust-quick=out/tests/rust.log
+    python tests/check_count.py python-quick=out/tests/python rust-quick=out/tests/rust.log
 
-A Python report is pytest's JUnit XML, a Rust one the output of `cargo test`. Tests that ran and failed count as run.
+A Python report is a folder of pytest's JUnit XML files, a Rust one the output of `cargo test`. Tests that ran and failed count as run.
 Skipped ones do not, unless their reason names PSSFLOW_SCENES, the folder of third-party scenes that a machine may lack.
 """
 
@@ -49,8 +49,11 @@ def main(arguments: list[str]) -> int:
         if name not in wanted or not report:
             print(f"{argument!r}: expected NAME=REPORT with NAME one of {', '.join(wanted)}")
             return 2
-        text = Path(report).read_text(encoding="utf-8")
-        ran = ran_in_cargo(text) if name.startswith("rust") else ran_in_pytest(text)
+        if name.startswith("rust"):
+            ran = ran_in_cargo(Path(report).read_text(encoding="utf-8"))
+        else:
+            parts = sorted(Path(report).glob("*.xml"))
+            ran = sum(ran_in_pytest(part.read_text(encoding="utf-8")) for part in parts)
         if ran < wanted[name]:
             print(
                 f"{name}: {ran} tests ran, {wanted[name]} must. "
