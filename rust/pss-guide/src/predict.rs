@@ -3,7 +3,8 @@
 //! With m = a + (1 − a)·q, the variance of a pixel's estimate is ∫f²/m − I². The integral is estimated from paths
 //! drawn with density g, f²/(m·g), tile by tile of the image, and relative to the tile's mean as in relMSE:
 //!
-//! V(a) = Σ over tiles of [mean f²/(m·g) − Ī²] ÷ (Ī² + ε),  ε = (0.1 · mean of Ī)²,  gain(a) = V(1)/V(a).
+//! V(a) = Σ over tiles of [mean f²/(m·g) − Ī²] ÷ (Ī² + ε),  ε = (0.1 · mean of Ī)²,  gain(a) = V(1)/(V(a) + its standard
+//! error): the best of many candidates is else the one that chance favours.
 //!
 //! The spread between the pixels of a tile counts as noise that no guide removes, which makes gains conservative. Of the
 //! two terms of f each is divided by the density of its own numbers: f_nee²/m + (2 f_nee f_bsdf + f_bsdf²)/m′ with the
@@ -109,7 +110,7 @@ impl<'a> HeldOut<'a> {
             all: one.clone(),
             directions: one,
         };
-        held.uniform = held.variance(&one, 1.0);
+        held.uniform = held.variance(&one, 1.0).0;
         // Below that, what looks like variance is rounding.
         (held.uniform > 1e-6 * held.square.abs()).then_some(held)
     }
@@ -124,13 +125,15 @@ impl<'a> HeldOut<'a> {
         self.scale[self.tile(row)]
     }
 
-    /// gain(a) = V(1)/V(a) of the mixture with a guide of these densities.
+    /// gain(a) of the mixture with a guide of these densities.
     pub(crate) fn gain(&self, q: &Densities, a: f32) -> f64 {
         let least = self.uniform / MOST_GAIN;
-        self.uniform / self.variance(q, a).max(least)
+        let (variance, error) = self.variance(q, a);
+        self.uniform / (variance + error).max(least)
     }
 
-    fn variance(&self, q: &Densities, a: f32) -> f64 {
+    /// V(a), and its standard error.
+    fn variance(&self, q: &Densities, a: f32) -> (f64, f64) {
         let a = f64::from(a);
         let mixture = |q: f32| {
             if a >= 1.0 {
@@ -139,14 +142,16 @@ impl<'a> HeldOut<'a> {
                 a + (1.0 - a) * f64::from(q)
             }
         };
-        let mut sum = 0.0;
+        let (mut sum, mut squares) = (0.0, 0.0);
         for row in self.rows() {
             let terms = self.records.terms(row);
             let value = terms.nee_square() / mixture(q.all[row])
                 + terms.bsdf_square() / mixture(q.directions[row]);
-            sum += value * self.scale[self.tile(row)];
+            let share = value * self.scale[self.tile(row)];
+            sum += share;
+            squares += share * share;
         }
-        sum - self.square
+        (sum - self.square, squares.sqrt())
     }
 
     fn rows(&self) -> impl Iterator<Item = usize> + use<'a> {

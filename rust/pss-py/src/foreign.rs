@@ -144,6 +144,11 @@ impl Learner for ForeignGuide {
         &self.name
     }
 
+    // Python libraries may keep state by thread.
+    fn on_callers_thread(&self) -> bool {
+        true
+    }
+
     fn fit(
         &self,
         records: &Records<'_>,

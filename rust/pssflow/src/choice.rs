@@ -32,6 +32,11 @@ pub trait Learner: Send + Sync {
         DEFAULT_UNIFORM_FRACTION
     }
 
+    /// Whether it must be fitted by the thread that called the render, and not among the render's own threads.
+    fn on_callers_thread(&self) -> bool {
+        false
+    }
+
     /// Learns. `progress` gets the share that is done and answers whether to go on.
     ///
     /// # Errors

@@ -211,6 +211,7 @@ impl Run<'_> {
             phase: if pilot { Phase::Pilot } else { Phase::Render },
             first_sample: self.next_sample,
             spp,
+            weight: self.options.combine.weight(kind),
             guide: guide.as_deref().map(|g| (g, mixture)),
             record,
             contexts: self.options.guide.looks_at_contexts(),

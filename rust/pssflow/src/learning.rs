@@ -14,6 +14,9 @@ use crate::progress::Phase;
 /// Learning again must promise to take no more than this share of the time that is left.
 const RELEARNING_TIME: f64 = 0.05;
 
+/// Share of a training from which on its end can be foretold.
+const ENOUGH_TO_TELL: f64 = 0.2;
+
 /// Where a chooser picked nothing from as many light-carrying paths, more would not change its mind: keeping them and
 /// choosing again only costs.
 const ENOUGH_FOR_NONE: usize = 1 << 16;
@@ -103,7 +106,8 @@ impl Run<'_> {
 
     fn fit(&mut self, learner: &dyn Learner) -> Result<(), RenderError> {
         let seed = self.options.seed;
-        let fit = self.learning(|records, report| learner.fit(records, seed, report))?;
+        let here = learner.on_callers_thread();
+        let fit = self.learning(here, |records, report| learner.fit(records, seed, report))?;
         if let Some(fit) = fit {
             let a = learner.uniform_fraction();
             self.take(fit, learner, a)?;
@@ -114,7 +118,7 @@ impl Run<'_> {
     fn choose(&mut self, chooser: &dyn Chooser, left: Left) -> Result<(), RenderError> {
         let seed = self.options.seed;
         let chosen =
-            self.learning(|records, report| chooser.choose(records, &left, seed, report))?;
+            self.learning(false, |records, report| chooser.choose(records, &left, seed, report))?;
         let Some(chosen) = chosen else { return Ok(()) };
         self.current.candidates = chosen.candidates;
         match (chosen.learner, chosen.fit) {
@@ -157,11 +161,12 @@ impl Run<'_> {
         Ok(())
     }
 
-    /// Runs something that learns, timed. `None`, with the reason kept, where there is nothing to learn from or no time
-    /// left; a guide learned earlier then stays.
-    fn learning<T>(
+    /// Runs something that learns, timed, among the render's threads or, where it must be, `here`. `None`, with the reason
+    /// kept, where there is nothing to learn from or no time left; a guide learned earlier then stays.
+    fn learning<T: Send>(
         &mut self,
-        work: impl FnOnce(&Records<'_>, &mut dyn FnMut(f32) -> bool) -> Result<T, GuideError>,
+        here: bool,
+        work: impl FnOnce(&Records<'_>, &mut dyn FnMut(f32) -> bool) -> Result<T, GuideError> + Send,
     ) -> Result<Option<T>, RenderError> {
         let start = Instant::now();
         let deadline = match self.options.budget {
@@ -172,11 +177,23 @@ impl Run<'_> {
         let mut late = false;
         let mut report = |done: f32| {
             progress.update(Phase::Fit, done);
-            late = clock.elapsed().as_secs_f64() > deadline;
+            let now = clock.elapsed().as_secs_f64();
+            // Time spent on a training that cannot end is lost twice.
+            let end = if f64::from(done) < ENOUGH_TO_TELL {
+                now
+            } else {
+                now + start.elapsed().as_secs_f64() * (1.0 / f64::from(done) - 1.0)
+            };
+            late = end > deadline;
             !late && !progress.cancelled()
         };
         let dims = self.context.tracer.columns().learned();
-        let done = work(&self.records.view(dims, &self.emitters), &mut report);
+        let records = self.records.view(dims, &self.emitters);
+        let done = if here {
+            work(&records, &mut report)
+        } else {
+            self.context.pool.install(|| work(&records, &mut report))
+        };
         self.current.learned_from = self.next_sample;
         self.current.seconds = start.elapsed().as_secs_f64();
         self.seconds.fit += self.current.seconds;

@@ -29,11 +29,19 @@ pub enum PassKind {
     Uniform,
 }
 
+/// What a sample of the pilot counts in the image beside one of a later pass. Fixed, since a weight that looked at the
+/// samples would bias the image. Where the guide's paths have 1/G of the variance of a pilot's and the pilot is a share s
+/// of all, the image gains (1 − s + s/2)² ÷ ((1 − s)/G + s/4) over uniform numbers: with s = ⅛, at most 28 in place of 8,
+/// and where nothing is learned 3 % are lost.
+pub(crate) const PILOT_WEIGHT: f64 = 0.5;
+
 /// How passes become one image.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Combine {
-    /// Every sample counts the same: weights are fixed before sampling, and the image is unbiased.
+    /// A sample of the pilot counts half, all others the same. These weights are fixed before sampling, so with a number
+    /// of samples the image is unbiased; with a time, what a pass came to may decide how many follow, a bias of the order
+    /// of 1 ÷ their number.
     #[default]
     Samples,
     /// Each pass's samples count with 1 ÷ their variance, one number for the whole image, estimated for each half of
@@ -47,6 +55,14 @@ impl Combine {
         match self {
             Self::Samples => "samples",
             Self::Variance => "variance",
+        }
+    }
+
+    /// What a sample of such a pass counts, as far as that is known before it is drawn.
+    pub(crate) fn weight(self, kind: PassKind) -> f64 {
+        match (self, kind) {
+            (Self::Samples, PassKind::Pilot) => PILOT_WEIGHT,
+            _ => 1.0,
         }
     }
 }

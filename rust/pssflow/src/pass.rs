@@ -77,6 +77,8 @@ pub(crate) struct Pass<'a> {
     /// First sample index; samples of different passes must not overlap.
     pub(crate) first_sample: u32,
     pub(crate) spp: u32,
+    /// What a sample counts in the image.
+    pub(crate) weight: f64,
     /// `None`: uniform numbers.
     pub(crate) guide: Option<(&'a dyn Guide, Mixture)>,
     /// Share of the light-carrying paths to record, 0 for none.
@@ -123,7 +125,7 @@ impl PassContext<'_> {
                 let Some(mut piece) = piece else {
                     return Err(RenderError::Cancelled);
                 };
-                image.merge(&piece.sums);
+                image.merge_weighted(&piece.sums, |_, _| pass.weight);
                 total.statistics.add(&piece.result.statistics);
                 total.records.append(&mut piece.result.records);
             }

@@ -164,7 +164,7 @@ impl Run<'_> {
         let share = PILOT_TIME[usize::from(refines)];
         let more = match self.options.pilot_spp {
             Some(spp) => spp - 1,
-            None => ((time * share - each) / each).clamp(0.0, f64::from(1 << 20)) as u32,
+            None => self.worth_keeping(((time * share - each) / each).clamp(0.0, f64::from(1 << 20)) as u32),
         };
         if more == 0 {
             return Ok(());
@@ -184,14 +184,25 @@ impl Run<'_> {
         Ok(())
     }
 
+    /// Of so many more samples of a pilot, those whose light-carrying paths can all be kept: the others would only be
+    /// uniform.
+    fn worth_keeping(&self, spp: u32) -> u32 {
+        let each = self.pilot.counts.nonzero as f64 / f64::from(self.next_sample.max(1));
+        spp.min((self.room(self.options.guide.refines()) / each.max(1.0)) as u32)
+    }
+
     /// Share of the light-carrying paths to keep so that a pass of `spp` fits the memory that is left for records, or
     /// half of it if more passes are to teach, even if every path carries light. At random, since every other rule would
     /// prefer a part of the image.
     fn record_share(&self, spp: u32, more: bool) -> f32 {
         let paths = self.context.tracer.scene().film().pixels() as f64 * f64::from(spp);
+        (self.room(more) / paths).min(1.0) as f32
+    }
+
+    /// Records that may still be kept, or half of them if more passes are to teach.
+    fn room(&self, more: bool) -> f64 {
         let room = self.options.max_records.saturating_sub(self.records.len()) as f64;
-        let room = if more { 0.5 * room } else { room };
-        (room / paths).min(1.0) as f32
+        if more { 0.5 * room } else { room }
     }
 
     fn kind(&self) -> PassKind {

@@ -324,22 +324,28 @@ fn a_chooser_may_change_its_mind_as_paths_grow() {
     );
     assert_eq!(outcome.candidates[0]["chosen"], true);
 
-    // What ends in `none` is the image of uniform numbers.
+    // What ends in `none` is the image of uniform numbers, the pilot's at half their weight.
     let none = render(
         &scene,
         &options(patient(u64::MAX), Budget::Spp(32)),
         &Silent,
     )
     .unwrap();
-    let plain = render(
-        &scene,
-        &options(GuideChoice::None, Budget::Spp(32)),
-        &Silent,
-    )
-    .unwrap();
+    let plain = |spp| {
+        render(
+            &scene,
+            &options(GuideChoice::None, Budget::Spp(spp)),
+            &Silent,
+        )
+        .unwrap()
+        .film
+    };
+    let (all, pilot) = (plain(32), plain(4));
     assert_eq!(none.chosen, "none");
-    assert_eq!(none.film.found, plain.film.found);
-    for (a, b) in none.film.image.iter().zip(&plain.film.image) {
-        assert!((a - b).abs() < 1e-6, "{a} {b}");
+    assert_eq!(none.film.found, all.found);
+    let images = none.film.image.iter().zip(all.image.iter().zip(&pilot.image));
+    for (a, (all, pilot)) in images {
+        let expected = (32.0 * all - 2.0 * pilot) / 30.0;
+        assert!((a - expected).abs() < 1e-6, "{a} {expected}");
     }
 }
