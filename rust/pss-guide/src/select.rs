@@ -2,8 +2,9 @@
 //!
 //! A quarter of the paths so far is held out; candidates are fitted to the rest, and what they would gain is predicted
 //! from the quarter (`predict`), for several shares a of uniform paths. Of the gain goes what the guide costs: its
-//! share of a path's time, and its training out of what is left of the budget. Whatever wins is fitted again to
-//! all paths; where nothing surely wins, uniform numbers stay, and no path was wasted.
+//! share of a path's time, and its training out of what is left of the budget. What passes to come will teach is
+//! foreseen: a guide that is refined gains more than the paths so far can show ([`Remaining::refinement`]). Whatever wins
+//! is fitted again to all paths; where nothing surely wins, uniform numbers stay, and no path was wasted.
 //!
 //! A composite's factors are fitted once; every subset of them is a candidate, so factors that do not pay are dropped.
 
@@ -58,6 +59,20 @@ pub struct Remaining {
     pub found: f64,
 }
 
+/// A gain's excess over one grows with the paths learned from by this power, and not beyond this factor. Of twelve scenes
+/// with four times the paths, the middle one's grew by a power of .25, the least one's by .17.
+const REFINEMENT: (f64, f64) = (0.2, 1.75);
+
+impl Remaining {
+    /// How much more a guide that is refined gains over the paths to come than from `paths` alone: it draws half of all
+    /// from a fit to the other half, about.
+    fn refinement(&self, paths: f64) -> f64 {
+        let (power, most) = REFINEMENT;
+        let more = 0.5 * (paths + self.paths) / paths.max(1.0);
+        more.max(1.0).powf(power).min(most)
+    }
+}
+
 /// What was thought of a candidate.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct CandidateReport {
@@ -65,13 +80,13 @@ pub struct CandidateReport {
     pub name: String,
     /// The best share of uniform paths in its mixture.
     pub a: f32,
-    /// Predicted variance of uniform numbers ÷ that of the mixture; 1 for `none`.
+    /// Predicted variance of uniform numbers ÷ that of the mixture, as fitted to the paths so far; 1 for `none`.
     pub predicted_gain: f64,
     /// What the guide adds to the cost of a path, as a share of it.
     pub cost_ratio: f64,
     /// Share of the time that is left that training it takes.
     pub training_share: f64,
-    /// The gain, costs deducted.
+    /// The gain that is expected of all paths to come, costs deducted.
     pub net_gain: f64,
     /// Whether it is used.
     pub chosen: bool,
@@ -150,7 +165,7 @@ pub fn select(
             match consider(
                 &family,
                 &fitted_to,
-                growth,
+                (growth, records.paths()),
                 &held,
                 remaining,
                 seed,
@@ -230,12 +245,12 @@ impl Considered {
     }
 }
 
-/// Fits the factors of a composite, and predicts the gain of all subsets of them; a fit to all paths has `growth` times
-/// as many.
+/// Fits the factors of a composite, and predicts the gain of all subsets of them; a fit to all rows has `growth` times
+/// as many, of so many paths.
 fn consider(
     family: &Recipe,
     fitted_to: &Records<'_>,
-    growth: f64,
+    (growth, paths): (f64, f64),
     held: &HeldOut<'_>,
     remaining: &Remaining,
     seed: u64,
@@ -266,6 +281,12 @@ fn consider(
         let recipe = family.subset(&factors);
         let seconds = factors.iter().map(|&i| fits[i].seconds).sum();
         let training_share = training_share(&recipe, fitted_to, growth, seconds, remaining);
+        let refinement = if recipe.refines() {
+            remaining.refinement(paths)
+        } else {
+            1.0
+        };
+        let expected = gain + (gain - 1.0).max(0.0) * (refinement - 1.0);
         members.push(Considered {
             report: CandidateReport {
                 name: recipe.label(),
@@ -273,7 +294,7 @@ fn consider(
                 predicted_gain: gain,
                 cost_ratio,
                 training_share,
-                net_gain: gain / (1.0 + cost_ratio) * (1.0 - training_share).max(0.0),
+                net_gain: expected / (1.0 + cost_ratio) * (1.0 - training_share).max(0.0),
                 chosen: false,
                 why: String::new(),
             },

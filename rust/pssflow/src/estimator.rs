@@ -127,6 +127,7 @@ pub fn render(
         apart: Vec::new(),
         next_sample: 0,
         records: PathRecords::default(),
+        lit: 1.0,
         emitters: intervals
             .map(|(cdf, environment)| Emitter { cdf, environment })
             .collect(),
@@ -171,6 +172,8 @@ pub(crate) struct Run<'a> {
     /// Samples per pixel so far.
     pub(crate) next_sample: u32,
     pub(crate) records: PathRecords,
+    /// Share of the last pass's paths that carried light.
+    pub(crate) lit: f64,
     pub(crate) emitters: Vec<Emitter>,
     pub(crate) current: Current,
     /// The guide of the last guided pass, its name and its share of uniform paths.
@@ -228,8 +231,12 @@ impl Run<'_> {
         self.apart.extend(own.filter(|_| !discarded));
         if record > 0.0 {
             result.records.count(result.statistics.counts.camera_rays);
+            result.records.thin(self.most_kept());
+            let rest = self.options.max_records - result.records.len();
+            self.records.thin(rest);
             self.records.append(&mut result.records);
         }
+        self.lit = result.statistics.counts.lit_share();
         self.next_sample += spp;
         let seconds = start.elapsed().as_secs_f64();
         if pilot {

@@ -11,15 +11,17 @@ use crate::estimator::Run;
 use crate::options::{Budget, PassPlan};
 use crate::progress::Phase;
 
-/// Learning again must promise to take no more than this share of the time that is left.
-const RELEARNING_TIME: f64 = 0.05;
+/// Learning again, from twice the samples, may take this share of the time that is left: about what it gains where a guide
+/// is in use, less where none paid so far and none may pay now.
+const RELEARNING_TIME: f64 = 0.1;
+const RECONSIDERING_TIME: f64 = 0.02;
 
 /// Share of a training from which on its end can be foretold.
 const ENOUGH_TO_TELL: f64 = 0.2;
 
 /// Where a chooser picked nothing from as many light-carrying paths, more would not change its mind: keeping them and
 /// choosing again only costs.
-const ENOUGH_FOR_NONE: usize = 1 << 16;
+const ENOUGH_FOR_NONE: usize = 1 << 19;
 
 /// What the next pass's numbers are drawn with, and how it came about.
 #[derive(Default)]
@@ -36,6 +38,8 @@ pub(crate) struct Current {
     pub(crate) settled: bool,
     /// Samples per pixel that it was learned from.
     pub(crate) learned_from: u32,
+    /// Paths that were kept then.
+    pub(crate) records: usize,
     /// Time that this took.
     pub(crate) seconds: f64,
     /// What the training reported.
@@ -62,14 +66,17 @@ impl Run<'_> {
 
     /// Learns from all paths kept so far where that is due: the first time, and whenever samples have doubled.
     pub(crate) fn learn(&mut self, left: Left) -> Result<(), RenderError> {
-        let due = self.next_sample >= 2 * self.current.learned_from.max(1)
-            || self.current.learned_from == 0;
-        if self.current.settled || !due {
+        if self.current.settled || self.next_sample < self.learning_due() {
             return Ok(());
         }
         if let Budget::Time(time) = self.options.budget {
             let remaining = time - self.clock.elapsed().as_secs_f64();
-            if self.current.seconds > RELEARNING_TIME * remaining {
+            let growth = self.records.len() as f64 / (self.current.records as f64).max(1.0);
+            let share = match self.current.guide {
+                Some(_) => RELEARNING_TIME,
+                None => RECONSIDERING_TIME,
+            };
+            if self.current.seconds * growth.max(1.0) > share * remaining {
                 self.current.settled = true;
                 return Ok(());
             }
@@ -79,6 +86,11 @@ impl Run<'_> {
             GuideChoice::Auto(chooser) => self.choose(chooser.as_ref(), left),
             GuideChoice::None | GuideChoice::Ready(_) => Ok(()),
         }
+    }
+
+    /// Samples per pixel at which there is enough news to learn from: twice as many as the last time.
+    pub(crate) fn learning_due(&self) -> u32 {
+        2 * self.current.learned_from
     }
 
     /// Learns what a recorded pass was drawn with.
@@ -117,8 +129,9 @@ impl Run<'_> {
 
     fn choose(&mut self, chooser: &dyn Chooser, left: Left) -> Result<(), RenderError> {
         let seed = self.options.seed;
-        let chosen =
-            self.learning(false, |records, report| chooser.choose(records, &left, seed, report))?;
+        let chosen = self.learning(false, |records, report| {
+            chooser.choose(records, &left, seed, report)
+        })?;
         let Some(chosen) = chosen else { return Ok(()) };
         self.current.candidates = chosen.candidates;
         match (chosen.learner, chosen.fit) {
@@ -195,6 +208,7 @@ impl Run<'_> {
             self.context.pool.install(|| work(&records, &mut report))
         };
         self.current.learned_from = self.next_sample;
+        self.current.records = self.records.len();
         self.current.seconds = start.elapsed().as_secs_f64();
         self.seconds.fit += self.current.seconds;
         match done {

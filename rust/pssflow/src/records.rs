@@ -62,6 +62,27 @@ impl PathRecords {
         }
     }
 
+    /// Keeps `most` paths, evenly from the first to the last; each then stands for as many more.
+    pub(crate) fn thin(&mut self, most: usize) {
+        let all = self.len();
+        if all <= most {
+            return;
+        }
+        let (kept, of) = (most as u64, all as u64);
+        let stays = |row: usize| (row as u64 + 1) * kept / of > row as u64 * kept / of;
+        let share = most as f32 / all as f32;
+        keep(&mut self.u, all, stays);
+        for numbers in [&mut self.f, &mut self.f_bsdf, &mut self.f_max] {
+            keep(numbers, all, stays);
+        }
+        for density in [&mut self.g, &mut self.g_bsdf] {
+            keep(density, all, stays);
+            density.iter_mut().for_each(|g| *g *= share);
+        }
+        keep(&mut self.contexts, all, stays);
+        keep(&mut self.pixel, all, stays);
+    }
+
     pub(crate) fn append(&mut self, other: &mut Self) {
         self.u.append(&mut other.u);
         self.f.append(&mut other.f);
@@ -89,5 +110,51 @@ impl PathRecords {
             emitters,
             zeros: self.drawn.saturating_sub(self.f.len() as u64),
         }
+    }
+}
+
+/// Keeps the values of those of `rows` rows that stay.
+fn keep<T: Copy>(values: &mut Vec<T>, rows: usize, stays: impl Fn(usize) -> bool) {
+    let width = values.len() / rows;
+    let mut end = 0;
+    for row in (0..rows).filter(|&row| stays(row)) {
+        values.copy_within(row * width..(row + 1) * width, end);
+        end += width;
+    }
+    values.truncate(end);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn thinned_records_stand_for_all() {
+        let paths = 1000u16;
+        let values = || (0..paths).map(f32::from);
+        let mut records = PathRecords {
+            u: values().flat_map(|x| [x, -x]).collect(),
+            f: values().collect(),
+            f_bsdf: values().collect(),
+            f_max: values().collect(),
+            g: vec![1.0; paths.into()],
+            g_bsdf: vec![1.0; paths.into()],
+            contexts: Vec::new(),
+            pixel: values().map(|x| [x, x]).collect(),
+            drawn: 4000,
+        };
+        let sum = |r: &PathRecords| r.f.iter().zip(&r.g).map(|(f, g)| f / g).sum::<f32>();
+        let before = sum(&records);
+        records.thin(2000);
+        assert_eq!(records.len(), 1000);
+        records.thin(300);
+        assert_eq!(records.len(), 300);
+        for (i, &x) in records.f.iter().enumerate() {
+            assert_eq!(records.u[2 * i..2 * i + 2], [x, -x]);
+            assert_eq!(records.pixel[i], [x, x]);
+        }
+        assert!((sum(&records) / before - 1.0).abs() < 0.01);
+        records.thin(0);
+        assert!(records.u.is_empty() && records.pixel.is_empty());
     }
 }

@@ -6,15 +6,22 @@ use crate::estimator::Run;
 use crate::options::{Options, PassKind, PassPlan};
 
 /// Share of a time budget that the pilot may take, for a guide that is trained once and for one that is refined: later
-/// passes teach the latter, too.
+/// passes, of whose paths more carry light, teach the latter, too.
 const PILOT_TIME: [f64; 2] = [1.0 / 7.0, 1.0 / 10.0];
 /// Under `--spp`, one sample in so many is the pilot's, likewise.
 const PILOT_DIVISOR: [u32; 2] = [4, 8];
 
 /// Share of a time budget that training is planned to take; what takes longer than the whole is given up.
 const TRAINING_TIME: f64 = 0.3;
-/// Samples per pixel that a timed pilot's memory for records is planned for.
-const TIMED_PILOT_SPP: u32 = 64;
+/// Paths that carry light of which a guide that is refined is first learned; a pilot that has found as many ends, and may
+/// have taken no more than [`LEAST_PILOT_TIME`].
+const ENOUGH_TO_START: f64 = 65_536.0;
+const LEAST_PILOT_TIME: f64 = 1.0 / 40.0;
+
+/// How much more light the paths of a pass are taken to carry, at most, than those of the pass before: where the first
+/// guide comes between them, and else.
+const FIRST_GUIDED: f64 = 4.0;
+const NEXT_PASS: f64 = 1.25;
 
 /// Share of the time before a snapshot that a pass is planned to take: one that takes a quarter longer still is in time.
 /// The next pass uses the rest.
@@ -28,7 +35,7 @@ impl Run<'_> {
         if self.options.guide.learns() {
             let usual = (total / PILOT_DIVISOR[usize::from(refines)]).max(1);
             let spp = self.options.pilot_spp.unwrap_or(usual).min(total);
-            let record = self.record_share(spp, refines);
+            let record = self.record_share(PassKind::Pilot, spp);
             self.pass(PassKind::Pilot, spp, record, (0.0, 1.0))?;
         }
         let first = self.next_sample;
@@ -41,7 +48,7 @@ impl Run<'_> {
             let record = if last {
                 0.0
             } else {
-                self.record_share(spp, true)
+                self.record_share(self.kind(), spp)
             };
             let share = |n: u32| (n - first) as f32 / (total - first) as f32;
             let span = (share(self.next_sample), share(self.next_sample + spp));
@@ -101,25 +108,30 @@ impl Run<'_> {
             {
                 break;
             }
+            let teaches = refines && !self.current.settled;
+            let mut record = 0.0;
             if let Some(each) = each {
                 // What a snapshot cut short does not slow the doubling down.
-                spp = (2 * largest)
+                let doubled = if teaches {
+                    self.learning_due().saturating_sub(self.next_sample).max(1)
+                } else {
+                    2 * largest
+                };
+                spp = doubled
                     .min(self.affordable(each, time))
                     .min(Options::MOST_SPP.saturating_sub(self.next_sample));
                 if spp == 0 {
                     break;
                 }
             }
+            if teaches {
+                record = self.record_share(self.kind(), spp);
+            }
             let share = |t: f64| ((t - begin) / (time - begin).max(1e-9)).clamp(0.0, 1.0) as f32;
             let span = (
                 share(now),
                 share(now).max(0.99f32.min(share(now) * 2.0 + 0.01)),
             );
-            let record = if refines && !self.current.settled {
-                self.record_share(spp, true)
-            } else {
-                0.0
-            };
             // By the render's own clock, which snapshots do not run down.
             let start = self.clock.elapsed().as_secs_f64();
             self.pass(self.kind(), spp, record, span)?;
@@ -158,21 +170,30 @@ impl Run<'_> {
         let affordable = time * TRAINING_TIME / seconds_per_path.max(f64::MIN_POSITIVE);
         // How many paths carry light is not known yet; a quarter of all is on the high side.
         let first = (4.0 * affordable / pixels).min(1.0) as f32;
-        let first = first.min(self.record_share(TIMED_PILOT_SPP, false));
+        let first = first.min(self.record_share(PassKind::Pilot, 1));
         self.pass(PassKind::Pilot, 1, first, (0.0, 0.1))?;
         let each = self.clock.elapsed().as_secs_f64() - start;
-        let share = PILOT_TIME[usize::from(refines)];
+        let lit = self.pilot.counts.nonzero as f64;
         let more = match self.options.pilot_spp {
             Some(spp) => spp - 1,
-            None => self.worth_keeping(((time * share - each) / each).clamp(0.0, f64::from(1 << 20)) as u32),
+            None => {
+                let within =
+                    |share: f64| ((time * share - each) / each).clamp(0.0, f64::from(1 << 20));
+                let most = within(PILOT_TIME[usize::from(refines)]);
+                let enough = if refines {
+                    (ENOUGH_TO_START / lit.max(1.0)).max(within(LEAST_PILOT_TIME))
+                } else {
+                    self.most_kept() as f64 / lit.max(1.0)
+                };
+                most.min(enough) as u32
+            }
         };
         if more == 0 {
             return Ok(());
         }
-        let nonzero = self.pilot.counts.nonzero as f64 * f64::from(more);
         let left = (affordable - self.records.len() as f64).max(0.0);
-        let record = (left / nonzero.max(1.0)).min(1.0) as f32;
-        let record = record.min(self.record_share(more.max(TIMED_PILOT_SPP), refines));
+        let record = (left / (lit * f64::from(more)).max(1.0)).min(1.0) as f32;
+        let record = record.min(self.record_share(PassKind::Pilot, more));
         let mut left = more;
         while left > 0 {
             let spp = self.affordable(each, f64::INFINITY).clamp(1, left);
@@ -184,25 +205,29 @@ impl Run<'_> {
         Ok(())
     }
 
-    /// Of so many more samples of a pilot, those whose light-carrying paths can all be kept: the others would only be
-    /// uniform.
-    fn worth_keeping(&self, spp: u32) -> u32 {
-        let each = self.pilot.counts.nonzero as f64 / f64::from(self.next_sample.max(1));
-        spp.min((self.room(self.options.guide.refines()) / each.max(1.0)) as u32)
-    }
-
-    /// Share of the light-carrying paths to keep so that a pass of `spp` fits the memory that is left for records, or
-    /// half of it if more passes are to teach, even if every path carries light. At random, since every other rule would
-    /// prefer a part of the image.
-    fn record_share(&self, spp: u32, more: bool) -> f32 {
+    /// Share of the light-carrying paths of a pass of `spp` to keep, as many as [`Self::most_kept`] if about as many carry
+    /// light as in the pass before. At random, since every other rule would prefer a part of the image.
+    fn record_share(&self, kind: PassKind, spp: u32) -> f32 {
         let paths = self.context.tracer.scene().film().pixels() as f64 * f64::from(spp);
-        (self.room(more) / paths).min(1.0) as f32
+        let guided = |p: &PassPlan| p.kind == PassKind::Guided;
+        let more = match self.passes.last() {
+            None => 1.0,
+            Some(last) if kind == PassKind::Guided && !guided(last) => FIRST_GUIDED,
+            Some(_) => NEXT_PASS,
+        };
+        let lit = (more * self.lit).min(1.0) * paths;
+        (self.most_kept() as f64 / lit.max(1.0)).min(1.0) as f32
     }
 
-    /// Records that may still be kept, or half of them if more passes are to teach.
-    fn room(&self, more: bool) -> f64 {
-        let room = self.options.max_records.saturating_sub(self.records.len()) as f64;
-        if more { 0.5 * room } else { room }
+    /// Most paths of one pass that are kept: half of all, if more passes are to teach, whatever there is already gives
+    /// way to them.
+    pub(crate) fn most_kept(&self) -> usize {
+        let most = self.options.max_records;
+        if self.options.guide.refines() {
+            most.div_ceil(2)
+        } else {
+            most.saturating_sub(self.records.len())
+        }
     }
 
     fn kind(&self) -> PassKind {

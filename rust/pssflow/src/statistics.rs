@@ -24,6 +24,11 @@ impl Counts {
         self.nonzero as f64 / (self.paths_found as f64).max(1.0)
     }
 
+    /// nonzero ÷ camera_rays; 0 where there were none.
+    pub(crate) fn lit_share(&self) -> f64 {
+        self.nonzero as f64 / (self.camera_rays as f64).max(1.0)
+    }
+
     /// Adds another count.
     pub fn add(&mut self, other: &Self) {
         self.camera_rays += other.camera_rays;

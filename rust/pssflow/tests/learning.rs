@@ -343,7 +343,11 @@ fn a_chooser_may_change_its_mind_as_paths_grow() {
     let (all, pilot) = (plain(32), plain(4));
     assert_eq!(none.chosen, "none");
     assert_eq!(none.film.found, all.found);
-    let images = none.film.image.iter().zip(all.image.iter().zip(&pilot.image));
+    let images = none
+        .film
+        .image
+        .iter()
+        .zip(all.image.iter().zip(&pilot.image));
     for (a, (all, pilot)) in images {
         let expected = (32.0 * all - 2.0 * pilot) / 30.0;
         assert!((a - expected).abs() < 1e-6, "{a} {expected}");

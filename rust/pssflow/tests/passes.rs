@@ -103,7 +103,10 @@ fn a_plan_is_rendered_pass_by_pass_as_it_says() {
     assert_eq!(outcome.pilot.counts.camera_rays, 100);
     assert_eq!(outcome.rendered.counts.camera_rays, 300);
     // m = ½ + ½·3 = 2 in the guided samples and 1 elsewhere; a sample of the pilot counts half.
-    let (mean, expected) = (outcome.mean()[0], (50.0 / 4.0 + 100.0 / 4.0 + 200.0 / 8.0) / 350.0);
+    let (mean, expected) = (
+        outcome.mean()[0],
+        (50.0 / 4.0 + 100.0 / 4.0 + 200.0 / 8.0) / 350.0,
+    );
     assert!((mean - expected).abs() < 0.005, "{mean} {expected}");
 }
 
