@@ -3,6 +3,7 @@
 use std::ops::Range;
 
 use pss_rng::{Purpose, Stream};
+use rayon::prelude::*;
 
 use crate::{Context, Decision, Guide, GuideError};
 
@@ -85,6 +86,14 @@ impl Terms {
     pub(crate) fn value(&self) -> f64 {
         self.f_nee / self.g + self.f_bsdf / self.g_bsdf
     }
+}
+
+/// Reused buffers of a chunk of rows.
+#[derive(Default)]
+struct Scratch {
+    u: Vec<f32>,
+    contexts: Vec<Context>,
+    each: Vec<f32>,
 }
 
 /// Rows that survive cleaning.
@@ -189,26 +198,24 @@ impl Records<'_> {
     /// Multiplies into `q` the guide's density of one decision.
     pub(crate) fn multiply_density(&self, guide: &dyn Guide, decision: Decision, q: &mut [f32]) {
         const CHUNK: usize = 4096;
-        let (mut u, mut contexts, mut each) = (Vec::new(), Vec::new(), Vec::new());
         for (vertex, columns) in self.columns(decision) {
-            for first in (0..q.len()).step_by(CHUNK) {
-                let rows = first..(first + CHUNK).min(q.len());
+            let chunks = q.par_chunks_mut(CHUNK).enumerate();
+            chunks.for_each_init(Scratch::default, |scratch, (i, q)| {
+                let Scratch { u, contexts, each } = scratch;
+                let rows = i * CHUNK..i * CHUNK + q.len();
                 u.clear();
                 contexts.clear();
                 for row in rows.clone() {
                     u.extend_from_slice(&self.u[row * self.dims..][columns.clone()]);
                 }
                 if guide.looks_at_contexts(decision) {
-                    contexts.extend(rows.clone().map(|row| self.known(decision, row, vertex)));
+                    contexts.extend(rows.map(|row| self.known(decision, row, vertex)));
                 }
                 each.clear();
-                each.resize(rows.len(), 1.0);
-                guide.density(decision, &contexts, &u, &mut each);
-                q[rows]
-                    .iter_mut()
-                    .zip(&each)
-                    .for_each(|(q, each)| *q *= each);
-            }
+                each.resize(q.len(), 1.0);
+                guide.density(decision, contexts, u, each);
+                q.iter_mut().zip(each).for_each(|(q, each)| *q *= *each);
+            });
         }
     }
 

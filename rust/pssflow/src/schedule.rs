@@ -9,7 +9,7 @@ use crate::options::{Options, PassKind, PassPlan};
 /// passes, of whose paths more carry light, teach the latter, too.
 const PILOT_TIME: [f64; 2] = [1.0 / 7.0, 1.0 / 10.0];
 /// Under `--spp`, one sample in so many is the pilot's, likewise.
-const PILOT_DIVISOR: [u32; 2] = [4, 8];
+const PILOT_DIVISOR: [u32; 2] = [4, 32];
 
 /// Share of a time budget that training is planned to take; what takes longer than the whole is given up.
 const TRAINING_TIME: f64 = 0.3;

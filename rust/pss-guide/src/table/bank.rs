@@ -1,5 +1,7 @@
 //! Tables and where they apply: fitted, looked up, stored.
 
+use rayon::prelude::*;
+
 use super::cells::{CellMap, Grid, MOST_DEPTH};
 use super::line::{Line, Lines};
 use super::square::{self, Square};
@@ -11,7 +13,8 @@ use crate::file::Contents;
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Example {
     pub(super) group: u32,
-    pub(super) context: Context,
+    pub(super) position: [f32; 3],
+    pub(super) normal: [f32; 3],
     pub(super) leaf: u32,
     /// In (0, 1].
     pub(super) weight: f32,
@@ -63,7 +66,9 @@ impl<T> Bank<T> {
     /// The table that serves a vertex.
     #[inline]
     pub(super) fn find(&self, group: u32, context: &Context) -> Option<usize> {
-        let key = self.grid.key(group, self.oriented, context);
+        let key = self
+            .grid
+            .key(group, self.oriented, &context.position, &context.normal);
         self.map.find(&self.grid, key)
     }
 
@@ -81,15 +86,15 @@ impl<T> Bank<T> {
     where
         T: Default,
     {
-        let positions: Vec<[f32; 3]> = examples.iter().map(|e| e.context.position).collect();
+        let some = examples.iter().step_by(Grid::stride(examples.len()));
+        let positions: Vec<[f32; 3]> = some.map(|e| e.position).collect();
         let grid = Grid::around(&positions, plan.depth);
-        drop(positions);
         let row = |e: &Example| Row {
-            key: grid.key(e.group, plan.oriented, &e.context),
+            key: grid.key(e.group, plan.oriented, &e.position, &e.normal),
             bin: e.leaf,
             weight: e.weight,
         };
-        let mut rows: Vec<Row> = examples.iter().map(row).collect();
+        let mut rows: Vec<Row> = examples.par_iter().map(row).collect();
         let fitted = tree::fit(leaves, &grid, plan.pooled, &mut rows, plan.memory, progress)?;
         Some(Self::new(
             grid,

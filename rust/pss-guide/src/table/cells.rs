@@ -9,8 +9,6 @@
 //! cell    all    group    + normal   + grid of 2³  … + grid of 2^depth per axis
 //! ```
 
-use crate::Context;
-
 /// Finest grid: 64 cells per axis.
 pub(super) const MOST_DEPTH: usize = 6;
 
@@ -35,10 +33,15 @@ pub(crate) struct Grid {
 }
 
 impl Grid {
+    /// Of `n` positions, one in so many tells where the box is.
+    pub(super) fn stride(n: usize) -> usize {
+        n.div_ceil(BOX_SAMPLE).max(1)
+    }
+
     /// Fits the box; positions that are not finite are passed over. Far outliers would else make the cells of
     /// everything else too large, hence the quantiles.
     pub(crate) fn around(positions: &[[f32; 3]], depth: usize) -> Self {
-        let stride = positions.len().div_ceil(BOX_SAMPLE).max(1);
+        let stride = Self::stride(positions.len());
         let (mut origin, mut extent) = ([0.0; 3], [0.0f32; 3]);
         for axis in 0..3 {
             let mut values: Vec<f32> = positions
@@ -120,13 +123,15 @@ impl Grid {
 
     /// The finest cell's key.
     #[inline]
-    pub(super) fn key(&self, group: u32, oriented: bool, context: &Context) -> u64 {
-        let normal = if oriented {
-            dominant(&context.normal)
-        } else {
-            0
-        };
-        let cell = normal << (3 * self.depth) | self.code(&context.position);
+    pub(super) fn key(
+        &self,
+        group: u32,
+        oriented: bool,
+        position: &[f32; 3],
+        normal: &[f32; 3],
+    ) -> u64 {
+        let normal = if oriented { dominant(normal) } else { 0 };
+        let cell = normal << (3 * self.depth) | self.code(position);
         u64::from(group) << (3 * self.depth + 3) | cell
     }
 

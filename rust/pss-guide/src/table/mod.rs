@@ -16,6 +16,7 @@ pub(crate) mod options;
 mod square;
 mod tree;
 
+use rayon::prelude::*;
 use serde_json::{Map, Value, json};
 
 use self::bank::{Bank, Example, Plan, Squares};
@@ -137,7 +138,7 @@ impl TableGuide {
             memory: options.memory_mib << 20,
         };
         let line = Line::new(records.emitters.iter().map(|e| e.cdf), kappa);
-        let examples = |leaf: &dyn Fn(&[f32]) -> u32| rows.examples(kind, records, leaf);
+        let examples = |leaf: &(dyn Fn(&[f32]) -> u32 + Sync)| rows.examples(kind, records, leaf);
         let pair = |square: Square| move |u: &[f32]| square.leaf([u[0], u[1]]);
         let mut rest = |done: f32| progress(0.25 + 0.74 * done);
         let tables = match kind {
@@ -453,11 +454,11 @@ impl Weighted {
         &self,
         kind: Kind,
         records: &Records<'_>,
-        leaf: &dyn Fn(&[f32]) -> u32,
+        leaf: &(dyn Fn(&[f32]) -> u32 + Sync),
     ) -> Vec<Example> {
         let mut list = Vec::new();
         for (vertex, columns) in records.columns(kind.models()[0]) {
-            list.extend(self.rows.iter().map(|&(row, weight)| {
+            let example = |&(row, weight): &(usize, f32)| {
                 let context = records.context(row, vertex);
                 let u = &records.u[row * records.dims..][columns.clone()];
                 Example {
@@ -466,11 +467,13 @@ impl Weighted {
                         Kind::Emitter => 0,
                         Kind::Light => context.emitter,
                     },
-                    context,
+                    position: context.position,
+                    normal: context.normal,
                     leaf: leaf(u),
                     weight,
                 }
-            }));
+            };
+            list.par_extend(self.rows.par_iter().map(example));
         }
         list
     }
