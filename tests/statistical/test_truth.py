@@ -328,8 +328,31 @@ def test_learned_numbers_give_mitsubas_mean(
     assert r.has_power, r.explain(artifacts)
 
 
+@pytest.mark.parametrize(
+    ("name", "a"),
+    [
+        ("cornell-box", 0.1),
+        pytest.param("cornell-box", 0.5, marks=pytest.mark.long),
+        pytest.param("teapot", 0.1, marks=pytest.mark.long),
+    ],
+)
+def test_a_flow_that_looks_at_the_pixel_gives_mitsubas_mean(
+    name: str, a: float, artifacts: Path, record
+) -> None:
+    """H0: as above, the flow's networks knowing the film position: each pixel has a density of its own."""
+    learned = {"guide": "realnvp-logit", "guide_options": LEARNED | {"condition": "pixel"}}
+    r = welch(_truth(name, 2), _ours(name, **learned, uniform_fraction=a, pilot_spp=8, spp=64))
+    record["p"] = r.p
+    assert r.p > ALPHA / 2, r.explain(artifacts)
+    assert r.has_power, r.explain(artifacts)
+
+
 NET = "mixture-net+emitter-table+light-table"
-TABLES = ("direction-table", "emitter-table", "light-table", "table", "mixture-net", NET, "auto")
+SPLINES = "spline-net+emitter-table+light-table"
+TABLES = (
+    *("direction-table", "emitter-table", "light-table", "table"),
+    *("mixture-net", NET, "spline-net", SPLINES, "auto"),
+)
 
 
 def _table_cases() -> list[Any]:
@@ -341,6 +364,7 @@ def _table_cases() -> list[Any]:
         ("sun_and_sky", "table", 0.1, 3, "mis"),
         ("cornell-box", "mixture-net", 0.1, 3, "mis"),
         ("sun_and_sky", NET, 0.5, 2, "mis"),
+        ("glass_room", "spline-net", 0.1, 2, "mis"),
         ("sun_and_sky", "auto", 0.1, 2, "nee"),
         ("glass_room", "auto", 0.1, 2, "mis"),
     }

@@ -36,13 +36,14 @@ use serde::{Deserialize, Serialize};
 pub use error::GuideError;
 pub use file::{Contents, FORMAT_VERSION, load, load_unchecked};
 pub use flow::options::{Prior, RealNvpOptions};
-pub use net::options::MixtureNetOptions;
+pub use net::options::{MixtureNetOptions, NetOptions, SplineNetOptions};
+pub use options::Condition;
 pub use recipe::{ALIASES, Recipe};
 pub use records::{Emitter, Records};
 pub use registry::{FitFn, GuideSpec, find, fit, registry};
 pub use select::{CandidateReport, Remaining, Selection, candidates, recall, select};
 pub use table::options::{EmitterTableOptions, TableOptions};
-pub use vegas::options::{Condition, VegasOptions};
+pub use vegas::options::VegasOptions;
 
 /// What a number of a path decides; a guide models some of these.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]

@@ -1,9 +1,19 @@
 //! Options of a guide: JSON in, a checked struct out, and errors that name what is known.
 
-use serde::{Serialize, de::DeserializeOwned};
+use serde::{Deserialize, Serialize, de::DeserializeOwned};
 use serde_json::{Map, Value};
 
 use crate::GuideError;
+
+/// What a whole-path guide looks at.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Condition {
+    /// Nothing: one density for the whole image.
+    None,
+    /// The film position.
+    Pixel,
+}
 
 /// `defaults` with every entry of `given` written over it.
 pub(crate) fn parse<T>(

@@ -154,6 +154,20 @@ static REGISTRY: &[GuideSpec] = &[
         fit: |o, r, s, p| NetGuide::fit(Net::Mixture, o, r, s, p),
         restore: |c| NetGuide::restore(Net::Mixture, c),
     },
+    GuideSpec {
+        name: Net::Spline.name(),
+        summary: "the direction at each vertex: networks of place, normal and view say a spline for each number",
+        models: &[Decision::Direction],
+        defaults: || Net::Spline.defaults(),
+        validate: |o| Net::Spline.validate(o),
+        seconds_per_path: |_, d| Net::seconds_per_path(d),
+        seconds: |o, d, n| Net::Spline.seconds(o, d, n),
+        uniform_fraction: 0.25,
+        cost_ratio: 0.6,
+        refine: true,
+        fit: |o, r, s, p| NetGuide::fit(Net::Spline, o, r, s, p),
+        restore: |c| NetGuide::restore(Net::Spline, c),
+    },
 ];
 
 /// All guides that can be fitted. `none`, the uniform density, needs no fit and is the caller's.

@@ -109,7 +109,7 @@ pub struct Selection {
 
 /// The candidates of `auto`; every subset of a composite's factors is meant, too.
 ///
-/// `mixture-net` is none yet: what the held-out paths promise of it does not hold where few of them carry light
+/// `mixture-net` and `spline-net` are none yet: what the held-out paths promise of a net does not hold where few carry light
 /// (ARCHITECTURE.md).
 ///
 /// # Errors

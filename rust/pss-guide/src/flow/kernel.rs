@@ -29,7 +29,8 @@ pub(crate) struct Linear {
 /// y_a = x_a, y_b = x_b ⊙ exp(s(x_a)) + t(x_a).
 #[derive(Clone, Debug)]
 struct Coupling {
-    kept: Vec<usize>,
+    /// Columns that the networks look at: those kept, then what is known.
+    seen: Vec<usize>,
     changed: Vec<usize>,
     /// Networks of s and t.
     nets: [Vec<Linear>; 2],
@@ -39,6 +40,7 @@ struct Coupling {
 #[derive(Clone, Debug)]
 pub(crate) struct Kernel {
     dims: usize,
+    known: usize,
     /// Floats per row of the block that the widest layer writes.
     width: usize,
     s_max: f32,
@@ -59,14 +61,16 @@ impl Kernel {
         let shape = weights.shape;
         let couplings = (0..shape.couplings)
             .map(|c| {
-                let (keep, change): (Vec<_>, Vec<_>) = (0..shape.dims).partition(|&i| kept(c, i));
+                let (mut seen, change): (Vec<_>, Vec<_>) =
+                    (0..shape.dims).partition(|&i| kept(c, i));
+                seen.extend(shape.dims..shape.row());
                 let net = |which: usize| {
                     (0..shape.linear())
                         .map(|layer| {
                             let (inputs, outputs) = shape.widths(layer);
                             let all = |n: usize| (0..n).collect::<Vec<_>>();
                             let rows = if layer == 0 {
-                                keep.clone()
+                                seen.clone()
                             } else {
                                 all(inputs)
                             };
@@ -88,26 +92,35 @@ impl Kernel {
                 };
                 Coupling {
                     nets: [net(0), net(1)],
-                    kept: keep,
+                    seen,
                     changed: change,
                 }
             })
             .collect();
-        let width = shape.hidden.max(shape.dims).next_multiple_of(TILE);
+        let width = shape.hidden.max(shape.row());
         Self {
             dims: shape.dims,
-            width,
+            known: shape.known,
+            width: width.next_multiple_of(TILE),
             s_max: s_max as f32,
             couplings,
         }
     }
 
-    /// Maps the rows of `x` (n, dims) in place and writes Σ s per row: ln |∂x/∂z|, for both directions.
-    pub(crate) fn run(&self, direction: Direction, x: &mut [f32], log_det: &mut [f32]) {
+    /// Maps the rows of `x` (n, dims) in place, given those of `known` (n, known), and writes Σ s per row: ln |∂x/∂z|,
+    /// for both directions.
+    pub(crate) fn run(
+        &self,
+        direction: Direction,
+        x: &mut [f32],
+        known: &[f32],
+        log_det: &mut [f32],
+    ) {
         let pass = Pass {
             kernel: self,
             direction,
             x,
+            known,
             log_det,
         };
         #[cfg(target_arch = "x86_64")]
@@ -184,6 +197,7 @@ struct Pass<'a> {
     kernel: &'a Kernel,
     direction: Direction,
     x: &'a mut [f32],
+    known: &'a [f32],
     log_det: &'a mut [f32],
 }
 
@@ -196,14 +210,22 @@ impl WithSimd for Pass<'_> {
             kernel,
             direction,
             x,
+            known,
             log_det,
         } = self;
         let (d, rows) = (kernel.dims, 2 * S::F32_LANES);
         // Columns of the block lie one after another: value = block[column * rows + row].
-        let mut block = vec![0.0f32; d * rows];
+        let mut block = vec![0.0f32; (d + kernel.known) * rows];
         let mut det = vec![0.0f32; rows];
         let mut scratch = Scratch::new(kernel.width * rows);
-        for (x, log_det) in x.chunks_mut(d * rows).zip(log_det.chunks_mut(rows)) {
+        let blocks = x.chunks_mut(d * rows).zip(log_det.chunks_mut(rows));
+        for (first, (x, log_det)) in (0..).step_by(rows).zip(blocks) {
+            for row in 0..log_det.len() {
+                let known = &known[(first + row) * kernel.known..][..kernel.known];
+                for (column, &x) in (d..).zip(known) {
+                    block[column * rows + row] = x;
+                }
+            }
             for (row, x) in x.chunks_exact(d).enumerate() {
                 for (column, &x) in x.iter().enumerate() {
                     block[column * rows + row] = x;
@@ -271,7 +293,7 @@ impl Coupling {
             return;
         }
         let rows = det.len();
-        for (input, &column) in scratch.input.chunks_exact_mut(rows).zip(&self.kept) {
+        for (input, &column) in scratch.input.chunks_exact_mut(rows).zip(&self.seen) {
             input.copy_from_slice(&block[column * rows..][..rows]);
         }
         for (which, net) in self.nets.iter().enumerate().rev() {
@@ -307,6 +329,14 @@ impl Coupling {
             }
         }
     }
+}
+
+/// Cut to [−1, 1]; what is not a number becomes −1, as every other number would do.
+#[inline(always)]
+pub(crate) fn inside(x: f32) -> f32 {
+    // In this order they drop NaN, which `clamp` would keep.
+    #[allow(clippy::manual_clamp, reason = "a number comes out whatever goes in")]
+    x.max(-1.0).min(1.0)
 }
 
 /// exp in f32, relative error below 3e-7, argument clamped to ±87; branch-free, so that loops vectorise.
@@ -372,12 +402,13 @@ mod tests {
         let z: Vec<f32> = (0..5 * 37).map(|i| (i as f32).sin()).collect();
         for direction in [Direction::Generate, Direction::Normalise] {
             let (mut fast, mut det) = (z.clone(), vec![0.0; 37]);
-            kernel.run(direction, &mut fast, &mut det);
+            kernel.run(direction, &mut fast, &[], &mut det);
             let (mut slow, mut slow_det) = (z.clone(), vec![0.0; 37]);
             let pass = Pass {
                 kernel: &kernel,
                 direction,
                 x: &mut slow,
+                known: &[],
                 log_det: &mut slow_det,
             };
             Simd::vectorize(pulp::Scalar, pass);

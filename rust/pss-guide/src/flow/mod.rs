@@ -10,6 +10,9 @@
 //!   Where f32 has no number left (x > 17.3 rounds to u = 1, x < −87 to 0) the sample counts as outside
 //!   after all: moved to the last number, it would carry mass that the density there does not have.
 //!
+//! With the condition `pixel` (`realnvp-logit` only) all networks also look at the film position, as Zheng and Zwicker's do:
+//! ln q(u | pixel). Nothing is known of the vertices when a whole path is drawn.
+//!
 //! Base numbers come from the caller's uniform ones, z = Φ⁻¹(u + 2⁻²⁵): the middle of a 24-bit step, so
 //! that 0 is no special case. Start reading at [`RealNvp`]; networks are evaluated by `kernel`, trained by
 //! `train` in candle.
@@ -89,6 +92,11 @@ fn logit(u: f32) -> (f64, f64) {
     (a - b, -(a + b))
 }
 
+/// A film position as the networks see it, in [−1, 1]².
+fn film(pixel: &[f32; 2]) -> [f32; 2] {
+    pixel.map(|x| kernel::inside(2.0 * x - 1.0))
+}
+
 /// A trained flow.
 #[derive(Debug)]
 pub(crate) struct RealNvp {
@@ -134,7 +142,8 @@ impl RealNvp {
         let usable = records.usable(options.outlier_quantile)?;
         let samples = options.training_rows(usable.rows.len());
 
-        let mut x = Vec::with_capacity(samples * d);
+        let shape = Shape::new(d, &options);
+        let mut x = Vec::with_capacity(samples * shape.row());
         let mut log_jacobian = 0.0;
         for row in usable.resample(samples, seed) {
             for &u in &records.u[row * d..(row + 1) * d] {
@@ -147,9 +156,10 @@ impl RealNvp {
                     }
                 }
             }
+            if shape.known > 0 {
+                x.extend(film(&records.pixel(row)));
+            }
         }
-
-        let shape = Shape::new(d, &options);
         let trained = train::train(
             domain,
             &options,
@@ -224,14 +234,14 @@ impl RealNvp {
     }
 
     /// Uniform numbers → (u, q).
-    fn sample_path(&self, u: &mut [f32], q: &mut [f32]) {
+    fn sample_path(&self, u: &mut [f32], known: &[f32], q: &mut [f32]) {
         let d = self.dims();
         self.base(u);
         let prior: Vec<f64> = u
             .chunks_exact(d)
             .map(|z| log_prior(self.options.prior, z))
             .collect();
-        self.kernel.run(Direction::Generate, u, q);
+        self.kernel.run(Direction::Generate, u, known, q);
         let mut again = Vec::new();
         for (row, ((u, q), prior)) in u.chunks_exact_mut(d).zip(&mut *q).zip(prior).enumerate() {
             let mut log_q = prior - f64::from(*q);
@@ -258,13 +268,13 @@ impl RealNvp {
             }
         }
         if !again.is_empty() {
-            let rows: Vec<f32> = again
-                .iter()
-                .flat_map(|&r| &u[r * d..(r + 1) * d])
-                .copied()
-                .collect();
+            let rows = |of: &[f32], width: usize| -> Vec<f32> {
+                let row = |&r: &usize| of[r * width..][..width].to_vec();
+                again.iter().flat_map(row).collect()
+            };
+            let (numbers, known) = (rows(u, d), rows(known, self.weights.shape.known));
             let mut densities = vec![0.0; again.len()];
-            self.density_path(&rows, &mut densities);
+            self.density_path(&numbers, &known, &mut densities);
             for (row, density) in again.into_iter().zip(densities) {
                 q[row] = density;
             }
@@ -272,7 +282,7 @@ impl RealNvp {
     }
 
     /// u → q.
-    fn density_path(&self, u: &[f32], q: &mut [f32]) {
+    fn density_path(&self, u: &[f32], known: &[f32], q: &mut [f32]) {
         let d = self.dims();
         let mut x = u[..q.len() * d].to_vec();
         let mut log_jacobian = Vec::new();
@@ -288,7 +298,7 @@ impl RealNvp {
                 })
                 .collect();
         }
-        self.kernel.run(Direction::Normalise, &mut x, q);
+        self.kernel.run(Direction::Normalise, &mut x, known, q);
         for (row, (z, q)) in x.chunks_exact(d).zip(&mut *q).enumerate() {
             let outside = match self.domain {
                 Domain::Logit => !u[row * d..(row + 1) * d]
@@ -306,11 +316,21 @@ impl RealNvp {
         }
     }
 
+    /// What is known of each row, (rows, known); a row without context is at the film's corner.
+    fn known(&self, contexts: &[Context], rows: usize) -> Vec<f32> {
+        if self.weights.shape.known == 0 {
+            return Vec::new();
+        }
+        let pixel = |row| contexts.get(row).map_or([0.0; 2], |c: &Context| c.pixel);
+        (0..rows).flat_map(|row| film(&pixel(row))).collect()
+    }
+
     fn count_outside(&self) -> u32 {
         let d = self.dims();
         let stream = Stream::new(0, Purpose::Guide);
         let rows = 1024;
         let (mut u, mut q) = (vec![0.0; rows * d], vec![0.0; rows]);
+        let mut known = vec![0.0; rows * self.weights.shape.known];
         let mut outside = 0;
         for block in 0..OUTSIDE_SAMPLES / rows as u32 {
             for (row, u) in u.chunks_exact_mut(d).enumerate() {
@@ -321,7 +341,12 @@ impl RealNvp {
                         .for_each(|(u, word)| *u = to_unit(word));
                 }
             }
-            self.sample_path(&mut u, &mut q);
+            // Of all pixels together; the path's numbers take at most 16 groups.
+            for (row, known) in known.chunks_exact_mut(2).enumerate() {
+                let words = stream.block(block * rows as u32 + row as u32, 16, 0);
+                known.copy_from_slice(&film(&[to_unit(words[0]), to_unit(words[1])]));
+            }
+            self.sample_path(&mut u, &known, &mut q);
             outside += u
                 .chunks_exact(d)
                 .filter(|u| !u.iter().all(|u| (0.0..1.0).contains(u)))
@@ -361,20 +386,26 @@ impl Guide for RealNvp {
         self.dims()
     }
 
-    fn sample(&self, decision: Decision, _contexts: &[Context], u: &mut [f32], q: &mut [f32]) {
-        if decision != Decision::Path {
-            return q.fill(1.0);
-        }
-        let rows = q.len().min(u.len() / self.dims());
-        self.sample_path(&mut u[..rows * self.dims()], &mut q[..rows]);
+    fn looks_at_contexts(&self, decision: Decision) -> bool {
+        decision == Decision::Path && self.weights.shape.known > 0
     }
 
-    fn density(&self, decision: Decision, _contexts: &[Context], u: &[f32], q: &mut [f32]) {
+    fn sample(&self, decision: Decision, contexts: &[Context], u: &mut [f32], q: &mut [f32]) {
         if decision != Decision::Path {
             return q.fill(1.0);
         }
         let rows = q.len().min(u.len() / self.dims());
-        self.density_path(u, &mut q[..rows]);
+        let known = self.known(contexts, rows);
+        self.sample_path(&mut u[..rows * self.dims()], &known, &mut q[..rows]);
+    }
+
+    fn density(&self, decision: Decision, contexts: &[Context], u: &[f32], q: &mut [f32]) {
+        if decision != Decision::Path {
+            return q.fill(1.0);
+        }
+        let rows = q.len().min(u.len() / self.dims());
+        let known = self.known(contexts, rows);
+        self.density_path(u, &known, &mut q[..rows]);
     }
 
     fn mass_outside(&self) -> f64 {

@@ -1,8 +1,9 @@
 //! The flow's own operations in candle's graph, each with its derivative.
 //!
-//! The state of a batch is one tensor X (n, d + 1): the d numbers of a row, then ln |∂z/∂x| so far. A
-//! coupling is `Condition` → `Linear` per layer → `Affine`; `NegLogLikelihood` ends the graph. So fused, a
-//! step is about sixty nodes; in candle's elementwise operations it would be a thousand small tensors.
+//! The state of a batch is one tensor X (n, d + c + 1): the d numbers of a row, the c known beside them (the film
+//! position, or none), then ln |∂z/∂x| so far. A coupling is `Condition` → `Linear` per layer → `Affine`;
+//! `NegLogLikelihood` ends the graph. So fused, a step is about sixty nodes; in candle's elementwise operations it would be
+//! a thousand small tensors.
 
 use candle_core::{
     CpuStorage, CustomOp1, CustomOp2, CustomOp3, Error, Layout, Result, Shape, Storage, Tensor,
@@ -45,9 +46,16 @@ fn tensor(values: Vec<f32>, like: &Tensor) -> Result<Option<Tensor>> {
     Tensor::from_vec(values, like.shape(), like.device()).map(Some)
 }
 
-/// X (n, d + 1) → (2, n, d): what the networks of s and t see, masked columns 0.
+/// X → (2, n, d + c): what the networks of s and t see, masked columns 0.
 pub(crate) struct Condition {
     pub(crate) coupling: usize,
+    pub(crate) dims: usize,
+}
+
+impl Condition {
+    fn seen(&self, column: usize) -> bool {
+        column >= self.dims || kept(self.coupling, column)
+    }
 }
 
 impl CustomOp1 for Condition {
@@ -65,7 +73,7 @@ impl CustomOp1 for Condition {
                 row[..d]
                     .iter()
                     .enumerate()
-                    .map(|(i, &x)| if kept(self.coupling, i) { x } else { 0.0 }),
+                    .map(|(i, &x)| if self.seen(i) { x } else { 0.0 }),
             );
         }
         out.extend_from_within(..);
@@ -83,7 +91,7 @@ impl CustomOp1 for Condition {
                 .zip(s.chunks_exact(d))
                 .zip(t.chunks_exact(d))
             {
-                for i in (0..d).filter(|&i| kept(self.coupling, i)) {
+                for i in (0..d).filter(|&i| self.seen(i)) {
                     out[i] = s[i] + t[i];
                 }
             }
@@ -211,7 +219,7 @@ impl CustomOp2 for Affine {
         l2: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
         let (n, w) = l1.shape().dims2()?;
-        let d = w - 1;
+        let (_, _, d) = l2.shape().dims3()?;
         let mut out = floats(s1, l1)?.to_vec();
         let (raw, t) = floats(s2, l2)?.split_at(n * d);
         for ((x, raw), t) in out
@@ -222,7 +230,7 @@ impl CustomOp2 for Affine {
             for i in (0..d).filter(|&i| !kept(self.coupling, i)) {
                 let s = self.s_max * (raw[i] / self.s_max).tanh();
                 x[i] = (x[i] - t[i]) * (-s).exp();
-                x[d] -= s;
+                x[w - 1] -= s;
             }
         }
         Ok((CpuStorage::F32(out), l1.shape().clone()))
@@ -236,7 +244,7 @@ impl CustomOp2 for Affine {
         grad: &Tensor,
     ) -> Result<(Option<Tensor>, Option<Tensor>)> {
         let (n, w) = x.dims2()?;
-        let d = w - 1;
+        let (_, _, d) = st.dims3()?;
         let (gx, gst) = with([st, z, grad], |[st, z, g]| {
             let mut gx = g.to_vec();
             let mut gst = vec![0.0; 2 * n * d];
@@ -249,7 +257,7 @@ impl CustomOp2 for Affine {
                 for i in (0..d).filter(|&i| !kept(self.coupling, i)) {
                     let tanh = (st[row * d + i] / self.s_max).tanh();
                     gx[i] = g[i] * (-self.s_max * tanh).exp();
-                    gst[row * d + i] = -(g[i] * z[i] + g[d]) * (1.0 - tanh * tanh);
+                    gst[row * d + i] = -(g[i] * z[i] + g[w - 1]) * (1.0 - tanh * tanh);
                     gst[(n + row) * d + i] = -gx[i];
                 }
             }
@@ -259,9 +267,10 @@ impl CustomOp2 for Affine {
     }
 }
 
-/// Z (n, d + 1) → mean over the rows of −ln q = −ln prior(z) − ln |∂z/∂x|, a scalar.
+/// X of all z → mean over the rows of −ln q = −ln prior(z) − ln |∂z/∂x|, a scalar.
 pub(crate) struct NegLogLikelihood {
     pub(crate) prior: Prior,
+    pub(crate) dims: usize,
 }
 
 impl NegLogLikelihood {
@@ -279,7 +288,7 @@ impl CustomOp1 for NegLogLikelihood {
         let (n, w) = layout.shape().dims2()?;
         let mut sum = 0.0;
         for row in floats(storage, layout)?.chunks_exact(w) {
-            let (z, log_det) = (&row[..w - 1], f64::from(row[w - 1]));
+            let (z, log_det) = (&row[..self.dims], f64::from(row[w - 1]));
             sum -= if self.inside(z) {
                 log_det + super::log_prior(self.prior, z)
             } else {
@@ -298,9 +307,9 @@ impl CustomOp1 for NegLogLikelihood {
             let g = g[0] / n as f32;
             let mut out = vec![0.0; z.len()];
             for (out, z) in out.chunks_exact_mut(w).zip(z.chunks_exact(w)) {
-                if self.inside(&z[..w - 1]) {
+                if self.inside(&z[..self.dims]) {
                     if self.prior == Prior::Gaussian {
-                        for (out, &z) in out.iter_mut().zip(&z[..w - 1]) {
+                        for (out, &z) in out.iter_mut().zip(&z[..self.dims]) {
                             *out = g * z;
                         }
                     }

@@ -4,7 +4,8 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
 use super::Domain;
-use crate::{GuideError, options};
+use crate::GuideError;
+use crate::options::{self, Condition};
 
 /// Distribution of the base numbers z.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -46,6 +47,10 @@ pub struct RealNvpOptions {
     /// Paths brighter than this quantile of the largest RGB component are not learned from; in (0, 1],
     /// 1 keeps all. The estimate itself is not touched. (Default: 0.999)
     pub outlier_quantile: f64,
+    /// What the networks look at beside the numbers that a coupling keeps (Zheng and Zwicker 2019). `realnvp` has no
+    /// such option. (Default: none)
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub condition: Option<Condition>,
 }
 
 /// Largest training set that is used without being asked for.
@@ -68,6 +73,10 @@ impl RealNvpOptions {
             epochs: 7,
             samples: None,
             outlier_quantile: 0.999,
+            condition: match domain {
+                Domain::Cube => None,
+                Domain::Logit => Some(Condition::None),
+            },
         }
     }
 
@@ -131,9 +140,17 @@ impl RealNvpOptions {
         if self.samples.is_some() {
             return 0.0;
         }
-        let network = self.hidden * (self.hidden * (self.layers - 1) + 2 * dims);
+        let network = self.hidden * (self.hidden * (self.layers - 1) + 2 * dims + self.known());
         let parameters = 2 * self.couplings * network;
         6.0 * (parameters * self.epochs) as f64 / 32e9
+    }
+
+    /// Numbers that are known of a path before it is drawn: two of the film position, or none.
+    pub(super) fn known(&self) -> usize {
+        match self.condition {
+            Some(Condition::Pixel) => 2,
+            Some(Condition::None) | None => 0,
+        }
     }
 
     /// Rows of the training set drawn from `usable` paths.

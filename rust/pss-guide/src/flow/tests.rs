@@ -59,35 +59,48 @@ fn the_thesis_flow_has_85_840_parameters() {
     }
 }
 
-/// Shapes whose widths are no multiple of any vector length, down to one number per path.
-const SHAPES: [(usize, usize, usize, usize); 6] = [
-    (5, 8, 40, 4),
-    (1, 2, 7, 1),
-    (2, 4, 16, 2),
-    (3, 5, 13, 3),
-    (7, 4, 33, 1),
-    (12, 3, 5, 2),
+/// Numbers, couplings, units, hidden layers, condition: widths are no multiple of any vector length, down to one number per
+/// path, and the film position is wider than all else once.
+const SHAPES: [(usize, usize, usize, usize, &str); 8] = [
+    (5, 8, 40, 4, "none"),
+    (1, 2, 7, 1, "none"),
+    (2, 4, 16, 2, "none"),
+    (3, 5, 13, 3, "none"),
+    (7, 4, 33, 1, "none"),
+    (12, 3, 5, 2, "none"),
+    (5, 4, 13, 2, "pixel"),
+    (1, 2, 1, 1, "pixel"),
 ];
 
 #[test]
 fn the_kernel_computes_the_formula_both_ways_and_inverts_itself() {
-    for (dims, couplings, hidden, layers) in SHAPES {
-        let given =
-            json!({ "couplings": couplings, "hidden": hidden, "layers": layers, "s_max": 2.0 });
-        let options = options(Domain::Cube, given);
+    for (dims, couplings, hidden, layers, condition) in SHAPES {
+        let given = json!({
+            "couplings": couplings,
+            "hidden": hidden,
+            "layers": layers,
+            "condition": condition,
+            "s_max": 2.0,
+        });
+        let options = options(Domain::Logit, given);
         let weights = weights(dims, &options, 1.5);
         let exact = Twin::from(&weights);
         let kernel = Kernel::new(&weights, options.s_max);
         let rows = 53;
         let z = normal(rows, dims, 1);
+        let known = normal(rows, options.known(), 9);
+        let with_known = |numbers: &[f32], row: usize| {
+            let known = &known[row * options.known()..][..options.known()];
+            f64s(&[&numbers[row * dims..][..dims], known].concat())
+        };
         let (mut x, mut det) = (z.clone(), vec![0.0; rows]);
-        kernel.run(Direction::Generate, &mut x, &mut det);
+        kernel.run(Direction::Generate, &mut x, &known, &mut det);
         let (mut back, mut det_back) = (x.clone(), vec![0.0; rows]);
-        kernel.run(Direction::Normalise, &mut back, &mut det_back);
+        kernel.run(Direction::Normalise, &mut back, &known, &mut det_back);
         for row in 0..rows {
             let at = row * dims..(row + 1) * dims;
             let close = |a: f32, b: f64| (f64::from(a) - b).abs() < 1e-4 * (1.0 + b.abs());
-            let (want, log_det) = twin::generate(&exact, options.s_max, &f64s(&z[at.clone()]));
+            let (want, log_det) = twin::generate(&exact, options.s_max, &with_known(&z, row));
             assert!(
                 x[at.clone()].iter().zip(&want).all(|(&a, &b)| close(a, b)),
                 "{dims}-D: {:?} {want:?}",
@@ -98,7 +111,7 @@ fn the_kernel_computes_the_formula_both_ways_and_inverts_itself() {
                 "{dims}-D log-det: {} {log_det}",
                 det[row]
             );
-            let (_, log_det) = twin::normalise(&exact, options.s_max, &f64s(&x[at.clone()]));
+            let (_, log_det) = twin::normalise(&exact, options.s_max, &with_known(&x, row));
             assert!(
                 close(det_back[row], log_det),
                 "{dims}-D inverse log-det: {} {log_det}",
@@ -113,7 +126,8 @@ fn the_kernel_computes_the_formula_both_ways_and_inverts_itself() {
 
 #[test]
 fn the_log_determinant_is_that_of_the_jacobian() {
-    for (dims, couplings, hidden, layers) in SHAPES {
+    let shapes = SHAPES.into_iter().filter(|shape| shape.4 == "none");
+    for (dims, couplings, hidden, layers, _) in shapes {
         let given = json!({ "couplings": couplings, "hidden": hidden, "layers": layers });
         let options = options(Domain::Logit, given);
         let weights = weights(dims, &options, 1.5);
@@ -152,20 +166,31 @@ fn a_row_does_not_depend_on_the_rows_beside_it() {
 
 #[test]
 fn gradients_are_those_of_the_f64_twin() {
-    for (domain, prior) in [
-        (Domain::Cube, "gaussian"),
-        (Domain::Logit, "gaussian"),
-        (Domain::Cube, "hypercube"),
+    for (domain, prior, condition) in [
+        (Domain::Cube, "gaussian", None),
+        (Domain::Logit, "gaussian", None),
+        (Domain::Cube, "hypercube", None),
+        (Domain::Logit, "gaussian", Some("pixel")),
     ] {
-        let given = json!({ "couplings": 3, "hidden": 6, "layers": 2, "prior": prior });
+        let mut given = json!({ "couplings": 3, "hidden": 6, "layers": 2, "prior": prior });
+        if let Some(condition) = condition {
+            given["condition"] = condition.into();
+        }
         let options = options(domain, given);
+        let width = 3 + options.known();
         let weights = weights(3, &options, if prior == "hypercube" { 0.2 } else { 1.0 });
-        let x: Vec<f32> = uniform(20, 3, 4).iter().map(|u| 0.3 + 0.4 * u).collect();
+        let x: Vec<f32> = uniform(20, width, 4)
+            .iter()
+            .map(|u| 0.3 + 0.4 * u)
+            .collect();
         let rows: Vec<u32> = (0..20).collect();
         let exact = Twin::from(&weights);
         let mean = |twin: &Twin| -> f64 {
             let row = |x: &[f32]| twin::log_density(twin, options.s_max, options.prior, &f64s(x));
-            -x.chunks_exact(3).map(|x| row(x).max(-87.0)).sum::<f64>() / 20.0
+            -x.chunks_exact(width)
+                .map(|x| row(x).max(-87.0))
+                .sum::<f64>()
+                / 20.0
         };
         let (loss, gradients) = train::gradients(&options, &weights, &x, &rows).unwrap();
         assert!(
@@ -192,12 +217,16 @@ fn gradients_are_those_of_the_f64_twin() {
             }
         }
         // Of 522 parameters, masks silence 118; a flat prior does not see the last shifts either.
-        let live = if prior == "gaussian" {
-            404..=404
-        } else {
-            200..=403
+        // The film position adds two inputs to each of six networks of 6 units.
+        let live = match (prior, condition) {
+            ("gaussian", None) => 404..=404,
+            ("gaussian", Some(_)) => 476..=476,
+            _ => 200..=403,
         };
-        assert!(live.contains(&seen), "{prior}: {seen} gradients are not 0");
+        assert!(
+            live.contains(&seen),
+            "{prior}, {condition:?}: {seen} gradients are not 0"
+        );
     }
 }
 

@@ -24,7 +24,7 @@ pub(super) struct Trained {
     pub(super) history: Vec<EpochLoss>,
 }
 
-/// Trains on the rows of `x` (n, dims); `progress` gets the share done and returns false to cancel.
+/// Trains on the rows of `x` (n, dims + known); `progress` gets the share done and returns false to cancel.
 pub(super) fn train(
     domain: Domain,
     options: &RealNvpOptions,
@@ -38,7 +38,7 @@ pub(super) fn train(
         guide: guide.to_owned(),
         message,
     };
-    let rows = x.len() / weights.shape.dims;
+    let rows = x.len() / weights.shape.row();
     let batches = rows.div_ceil(options.batch);
     let mut order: Vec<u32> = (0..rows as u32).collect();
     let mut trainer = Trainer {
@@ -162,7 +162,7 @@ fn loss(
     rows: &[u32],
 ) -> TensorResult<Tensor> {
     let shape = weights.shape;
-    let d = shape.dims;
+    let d = shape.row();
     let mut state = Vec::with_capacity(rows.len() * (d + 1));
     for &row in rows {
         state.extend_from_slice(&x[row as usize * d..][..d]);
@@ -170,7 +170,10 @@ fn loss(
     }
     let mut state = Tensor::from_vec(state, (rows.len(), d + 1), &Device::Cpu)?;
     for coupling in (0..shape.couplings).rev() {
-        let mut y = state.apply_op1(Condition { coupling })?;
+        let mut y = state.apply_op1(Condition {
+            coupling,
+            dims: shape.dims,
+        })?;
         for layer in 0..shape.linear() {
             let at = (coupling * shape.linear() + layer) * 2;
             let leaky = layer < shape.layers;
@@ -190,6 +193,7 @@ fn loss(
     }
     state.apply_op1(NegLogLikelihood {
         prior: options.prior,
+        dims: shape.dims,
     })
 }
 

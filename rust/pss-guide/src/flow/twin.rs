@@ -22,13 +22,16 @@ impl From<&Weights> for Twin {
     }
 }
 
-/// A row of raw s or t: the network `which` (0: s, 1: t) of a coupling at `x`.
+/// A row of raw s or t: the network `which` (0: s, 1: t) of a coupling at `x`, behind whose numbers stand those known.
 fn network(twin: &Twin, coupling: usize, which: usize, x: &[f64]) -> Vec<f64> {
     let shape = twin.shape;
     let mut y: Vec<f64> = x
         .iter()
         .enumerate()
-        .map(|(i, &x)| if kept(coupling, i) { x } else { 0.0 })
+        .map(|(i, &x)| {
+            let seen = i >= shape.dims || kept(coupling, i);
+            if seen { x } else { 0.0 }
+        })
         .collect();
     for layer in 0..shape.linear() {
         let (inputs, outputs) = shape.widths(layer);
@@ -50,12 +53,12 @@ fn network(twin: &Twin, coupling: usize, which: usize, x: &[f64]) -> Vec<f64> {
     y
 }
 
-/// z → (x, Σ s).
+/// z → (x, Σ s); what is known stays as it is.
 pub(super) fn generate(twin: &Twin, s_max: f64, z: &[f64]) -> (Vec<f64>, f64) {
     let (mut x, mut log_det) = (z.to_vec(), 0.0);
     for coupling in 0..twin.shape.couplings {
         let [raw, t] = [0, 1].map(|which| network(twin, coupling, which, &x));
-        for i in (0..x.len()).filter(|&i| !kept(coupling, i)) {
+        for i in (0..twin.shape.dims).filter(|&i| !kept(coupling, i)) {
             let s = s_max * (raw[i] / s_max).tanh();
             x[i] = x[i] * s.exp() + t[i];
             log_det += s;
@@ -69,7 +72,7 @@ pub(super) fn normalise(twin: &Twin, s_max: f64, x: &[f64]) -> (Vec<f64>, f64) {
     let (mut z, mut log_det) = (x.to_vec(), 0.0);
     for coupling in (0..twin.shape.couplings).rev() {
         let [raw, t] = [0, 1].map(|which| network(twin, coupling, which, &z));
-        for i in (0..z.len()).filter(|&i| !kept(coupling, i)) {
+        for i in (0..twin.shape.dims).filter(|&i| !kept(coupling, i)) {
             let s = s_max * (raw[i] / s_max).tanh();
             z[i] = (z[i] - t[i]) * (-s).exp();
             log_det += s;
@@ -81,6 +84,7 @@ pub(super) fn normalise(twin: &Twin, s_max: f64, x: &[f64]) -> (Vec<f64>, f64) {
 /// ln q(x).
 pub(super) fn log_density(twin: &Twin, s_max: f64, prior: Prior, x: &[f64]) -> f64 {
     let (z, log_det) = normalise(twin, s_max, x);
+    let z = &z[..twin.shape.dims];
     let prior = match prior {
         Prior::Gaussian => z.iter().map(|z| -0.5 * z * z - LN_SQRT_TAU).sum(),
         Prior::Hypercube if z.iter().all(|z| (0.0..=1.0).contains(z)) => 0.0,

@@ -8,6 +8,8 @@ use super::options::RealNvpOptions;
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Shape {
     pub(crate) dims: usize,
+    /// Numbers that every network looks at beside those that its coupling keeps.
+    pub(crate) known: usize,
     pub(crate) couplings: usize,
     pub(crate) hidden: usize,
     /// Hidden layers; a network has one linear layer more.
@@ -18,10 +20,16 @@ impl Shape {
     pub(crate) fn new(dims: usize, options: &RealNvpOptions) -> Self {
         Self {
             dims,
+            known: options.known(),
             couplings: options.couplings,
             hidden: options.hidden,
             layers: options.layers,
         }
+    }
+
+    /// Numbers of a row in training, those known at its end.
+    pub(crate) fn row(&self) -> usize {
+        self.dims + self.known
     }
 
     /// Linear layers of a network.
@@ -31,7 +39,7 @@ impl Shape {
 
     /// Inputs and outputs of linear layer `layer`.
     pub(crate) fn widths(&self, layer: usize) -> (usize, usize) {
-        let inputs = if layer == 0 { self.dims } else { self.hidden };
+        let inputs = if layer == 0 { self.row() } else { self.hidden };
         let outputs = if layer == self.layers {
             self.dims
         } else {

@@ -8,41 +8,11 @@
 //! takes its component by the first number, which is stretched and used again, and each number from the component's
 //! inverse distribution; tails are measured from the end that is nearer, where f32 resolves them.
 
+use super::lanes::{BELOW_ONE, HALF_STEP, LANES, at_least, choose, load, part, softmax, store};
 use super::math::{FRAC_1_SQRT_PI, erfc, exp, inverse_erfc, ln, tanh};
-
-/// Half a step of a 24-bit uniform number.
-const HALF_STEP: f32 = 1.0 / 33_554_432.0;
-
-/// Largest number below 1 that a 24-bit uniform number takes.
-const BELOW_ONE: f32 = 1.0 - f32::EPSILON / 2.0;
 
 /// Least density; where all components are as far away, exp would leave f32's range.
 const LEAST: f32 = 1e-37;
-
-/// Most rows of a block: two vectors of AVX.
-const LANES: usize = 16;
-
-/// A value of each row. Loops run over copies on the stack, which cannot overlap: with as many slices the compiler would
-/// have to prove or to check that, and gives up on vectors.
-type Lanes = [f32; LANES];
-
-#[inline(always)]
-fn load(from: &[f32], rows: usize) -> Lanes {
-    let mut lanes = [0.0; LANES];
-    lanes[..rows].copy_from_slice(&from[..rows]);
-    lanes
-}
-
-/// The i-th values of all rows.
-#[inline(always)]
-fn part(from: &[f32], i: usize, rows: usize) -> Lanes {
-    load(&from[i * rows..], rows)
-}
-
-#[inline(always)]
-fn store(to: &mut [f32], i: usize, lanes: &Lanes, rows: usize) {
-    to[i * rows..][..rows].copy_from_slice(&lanes[..rows]);
-}
 
 /// Outputs of the network and what of them is prepared lie as `[value][row]`, `rows` to a value.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -135,39 +105,12 @@ impl Mixture {
         PREPARED * self.components
     }
 
-    /// Softmax of the logits of each row.
-    #[inline(always)]
-    fn shares(self, rows: usize, out: &[f32], pi: &mut [f32]) {
-        let n = self.components;
-        let mut most = [f32::NEG_INFINITY; LANES];
-        for j in 0..n {
-            let logit = part(out, j, rows);
-            for r in 0..rows {
-                most[r] = most[r].max(logit[r]);
-            }
-        }
-        let mut sum = [0.0; LANES];
-        for j in 0..n {
-            let mut share = part(out, j, rows);
-            for r in 0..rows {
-                share[r] = exp(share[r] - most[r]);
-                sum[r] += share[r];
-            }
-            store(pi, j, &share, rows);
-        }
-        for pi in pi.chunks_exact_mut(rows).take(n) {
-            for r in 0..rows {
-                pi[r] /= sum[r];
-            }
-        }
-    }
-
     /// Per component: share, height, then mean, width and both tails along each number.
     #[inline(always)]
     fn prepare(self, rows: usize, out: &[f32], scratch: &mut [f32]) {
         let n = self.components;
         let (pi, rest) = scratch.split_at_mut(n * rows);
-        self.shares(rows, out, pi);
+        softmax(n, rows, out, pi);
         let out = &out[n * rows..][..4 * n * rows];
         for j in 0..n {
             let row = |v: usize| part(out, v * n + j, rows);
@@ -238,22 +181,17 @@ impl Mixture {
         let mut below = [0.0; LANES];
         // What a sample wants of its component: where its interval begins, its share, and all that is prepared but the height.
         let mut chosen = [[0.0; LANES]; 10];
-        // The last component whose interval begins no higher than the number; selects, so that rows stay vectors.
+        // The last component whose interval begins no higher than the number; chosen by masks, so that rows stay vectors.
         for (j, component) in rest.chunks_exact(9 * rows).take(n).enumerate() {
             let pi = part(pi, j, rows);
+            let mask = at_least(rows, &x0, &below);
             for (i, chosen) in chosen.iter_mut().enumerate() {
                 let from = match i {
                     0 => below,
                     1 => pi,
                     _ => part(component, i - 1, rows),
                 };
-                for r in 0..rows {
-                    chosen[r] = if x0[r] >= below[r] {
-                        from[r]
-                    } else {
-                        chosen[r]
-                    };
-                }
+                *chosen = choose(rows, &mask, &from, chosen);
             }
             for r in 0..rows {
                 below[r] += pi[r];
@@ -333,7 +271,7 @@ impl Mixture {
         let n = self.components;
         let x = [load(x0, rows), load(x1, rows)];
         let (pi, weights) = scratch.split_at_mut(n * rows);
-        self.shares(rows, out, pi);
+        softmax(n, rows, out, pi);
         let mut sum = [LEAST; LANES];
         for j in 0..n {
             let row = |v: usize| part(out, v * n + j, rows);

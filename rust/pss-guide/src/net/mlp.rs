@@ -3,7 +3,7 @@
 use pss_rng::{Purpose, Stream};
 
 use crate::Context;
-use crate::flow::kernel::{Linear, SLOPE};
+use crate::flow::kernel::{Linear, SLOPE, inside};
 use crate::flow::product::{Strided, multiply};
 use crate::table::cells::Grid;
 
@@ -31,12 +31,8 @@ impl Place {
         }
     }
 
-    /// What is not a number becomes −1, as every other number would do.
     #[inline(always)]
     pub(super) fn features(&self, c: &Context) -> [f32; FEATURES] {
-        // In this order they drop NaN, which `clamp` would keep.
-        #[allow(clippy::manual_clamp, reason = "a number comes out whatever goes in")]
-        let inside = |x: f32| x.max(-1.0).min(1.0);
         let position: [f32; 3] = std::array::from_fn(|i| {
             if self.scale[i] == 0.0 {
                 return 0.0;

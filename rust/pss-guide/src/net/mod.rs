@@ -5,16 +5,19 @@
 //! context ─ place ─► inputs ─ network (32-32 units) ─► outputs ─ head ─► q(u₀, u₁ | context)
 //! ```
 //!
-//! `mixture-net`'s head is a mixture of truncated normals (`mixture`); its networks are evaluated on blocks of rows (`model`)
-//! and trained on the second moment of the estimate (`train`). All vertices x₁ … x_{k−1} of a path share the network. In a
+//! `mixture-net`'s head is a mixture of truncated normals (`mixture`). `spline-net` has two networks: one says a monotone
+//! spline for u₀, the other, which sees u₀ as well, one for u₁ (`spline`). Networks are evaluated on blocks of rows (`model`)
+//! and trained on the second moment of the estimate (`train`). All vertices x₁ … x_{k−1} of a path share them. In a
 //! composite it is fitted on f²/g of what the factors before it leave, as every guide is ([`crate::Recipe::fit`]). Learned mixtures
 //! for path guiding: Huang et al. 2024, doi:10.1145/3649310; here over primary numbers, so that the BSDF is part of what is learnt.
 
+mod lanes;
 mod math;
 mod mixture;
 mod mlp;
 mod model;
 pub(crate) mod options;
+mod spline;
 #[cfg(test)]
 mod tests;
 mod train;
@@ -22,16 +25,19 @@ mod train;
 use serde_json::{Map, Value, json};
 
 use self::mlp::{Mlp, Place};
-use self::model::{Head, Model, Packed};
-use self::options::MixtureNetOptions;
+use self::model::{Model, Packed};
+use self::options::{NetOptions, Options};
 use self::train::Data;
 use crate::file::{self, Contents};
 use crate::predict::HeldOut;
 use crate::records::Clipped;
-use crate::{Context, Decision, Fit, Guide, GuideError, Records, options as json_options};
+use crate::{Context, Decision, Fit, Guide, GuideError, Records};
 
 /// Seconds on one core that a decision, forward and back, takes with the default network, as `examples/guide_cost.rs` shows.
 const SECONDS_PER_DECISION: f64 = 1.4e-6;
+
+/// Multiplications of the default `mixture-net`.
+const USUAL_PRODUCTS: f64 = 2624.0;
 
 /// Seconds that preparing a path takes, per number of it.
 const SECONDS_PER_FEATURES: f64 = 2e-8;
@@ -40,6 +46,7 @@ const SECONDS_PER_FEATURES: f64 = 2e-8;
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Kind {
     Mixture,
+    Spline,
 }
 
 impl Kind {
@@ -47,17 +54,18 @@ impl Kind {
     pub(crate) const fn name(self) -> &'static str {
         match self {
             Self::Mixture => "mixture-net",
+            Self::Spline => "spline-net",
         }
     }
 
     /// Options with their defaults.
     pub(crate) fn defaults(self) -> Map<String, Value> {
-        json_options::to_map(&MixtureNetOptions::default())
+        Options::parse(self, &Map::new()).map_or_else(|_| Map::new(), |options| options.map)
     }
 
     /// Checks options.
     pub(crate) fn validate(self, given: &Map<String, Value>) -> Result<(), GuideError> {
-        MixtureNetOptions::parse(self, given).map(drop)
+        Options::parse(self, given).map(drop)
     }
 
     /// Seconds on one core that a path given costs beside the training: its features and its weight.
@@ -67,19 +75,14 @@ impl Kind {
 
     /// Seconds on one core that training on `rows` paths of `dims` numbers takes: of few, it makes more epochs.
     pub(crate) fn seconds(self, given: &Map<String, Value>, dims: usize, rows: usize) -> f64 {
-        let Ok(options) = MixtureNetOptions::parse(self, given) else {
+        let Ok(options) = Options::parse(self, given) else {
             return 0.0;
         };
-        let parameters = |o: &MixtureNetOptions| -> usize {
-            let widths = Head::new(self, o).widths(o);
-            let products = widths
-                .iter()
-                .flat_map(|w| w.windows(2).map(|w| w[0] * w[1]));
-            products.sum()
-        };
-        let size = parameters(&options) as f64 / parameters(&MixtureNetOptions::default()) as f64;
+        let products = |w: Vec<usize>| w.windows(2).map(|w| w[0] * w[1]).sum::<usize>();
+        let size: usize = options.widths().into_iter().map(products).sum();
+        let size = size as f64 / USUAL_PRODUCTS;
         let vertices = dims.saturating_sub(3) / 2;
-        (options.seen(rows) * vertices) as f64 * size * SECONDS_PER_DECISION
+        (options.net.seen(rows) * vertices) as f64 * size * SECONDS_PER_DECISION
     }
 }
 
@@ -88,7 +91,7 @@ impl Kind {
 pub(crate) struct NetGuide {
     kind: Kind,
     dims: usize,
-    options: MixtureNetOptions,
+    options: Options,
     /// What was met in training.
     facts: Value,
     place: Place,
@@ -100,7 +103,7 @@ impl NetGuide {
     fn new(
         kind: Kind,
         dims: usize,
-        options: MixtureNetOptions,
+        options: Options,
         facts: Value,
         place: Place,
         model: Model,
@@ -126,12 +129,12 @@ impl NetGuide {
         progress: &mut dyn FnMut(f32) -> bool,
     ) -> Result<Fit, GuideError> {
         let start = std::time::Instant::now();
-        let options = MixtureNetOptions::parse(kind, given)?;
+        let options = Options::parse(kind, given)?;
         let mut stage = |done: f32| progress(done).then_some(()).ok_or(GuideError::Cancelled);
         stage(0.0)?;
         let usable = records.usable(1.0)?;
         stage(0.02)?;
-        let rows = Weighted::new(records, &usable.rows, &options);
+        let rows = Weighted::new(records, &usable.rows, &options.net);
         let vertices = records.columns(Decision::Direction).count();
         let positions: Vec<[f32; 3]> = rows
             .paths
@@ -142,11 +145,18 @@ impl NetGuide {
         stage(0.05)?;
         let data = rows.data(records, &place, vertices);
         stage(0.08)?;
-        let mut model = Model::random(Head::new(kind, &options), &options, seed);
+        let mut model = Model::random(&options, seed);
         let mut history = Vec::new();
         if vertices > 0 && !data.weights.is_empty() {
             let mut share = |done: f32| progress(0.1 + 0.9 * done);
-            history = train::train(kind.name(), &options, &mut model, &data, seed, &mut share)?;
+            history = train::train(
+                kind.name(),
+                &options.net,
+                &mut model,
+                &data,
+                seed,
+                &mut share,
+            )?;
         }
         let samples = rows.paths.len();
         let facts = json!({
@@ -179,12 +189,11 @@ impl NetGuide {
         let given = given
             .as_object()
             .ok_or("its configuration has no `options`")?;
-        let options = MixtureNetOptions::parse(kind, given).map_err(|e| e.to_string())?;
-        let head = Head::new(kind, &options);
+        let options = Options::parse(kind, given).map_err(|e| e.to_string())?;
         if let Some((name, ..)) = contents.words.first() {
             return Err(format!("tensor {name:?} belongs to no net"));
         }
-        let mut values = file::take(contents.tensors, &names(head, &options))?;
+        let mut values = file::take(contents.tensors, &names(&options))?;
         if values.iter().flatten().any(|x| !x.is_finite()) {
             return Err("a weight is not a number".to_owned());
         }
@@ -202,7 +211,8 @@ impl NetGuide {
             tensors: values.by_ref().take(2 * (widths.len() - 1)).collect(),
             widths,
         };
-        let nets = head.widths(&options).into_iter().map(net).collect();
+        let nets = options.widths().into_iter().map(net).collect();
+        let head = options.head;
         let (model, facts) = (Model { head, nets }, config["facts"].take());
         Ok(Box::new(Self::new(
             kind, dims, options, facts, place, model,
@@ -211,8 +221,8 @@ impl NetGuide {
 }
 
 /// All tensors of a file, the box last.
-fn names(head: Head, options: &MixtureNetOptions) -> Vec<(String, Vec<usize>)> {
-    let widths = head.widths(options).into_iter().enumerate();
+fn names(options: &Options) -> Vec<(String, Vec<usize>)> {
+    let widths = options.widths().into_iter().enumerate();
     let nets = widths.flat_map(|(i, w)| Mlp::names(&w, &format!("net.{i}.linear.")));
     nets.chain([("place".to_owned(), vec![6])]).collect()
 }
@@ -267,7 +277,7 @@ impl Guide for NetGuide {
             "rows": self.facts["rows"],
             "epochs": self.facts["epochs"],
             "clipped": self.facts["clipped"],
-            "options": json_options::to_map(&self.options),
+            "options": self.options.map,
         })
     }
 
@@ -275,12 +285,12 @@ impl Guide for NetGuide {
         let bounds = self.place.origin.iter().chain(&self.place.scale).copied();
         let tensors = self.model.nets.iter().flat_map(|net| net.tensors.clone());
         let tensors = tensors.chain([bounds.collect()]);
-        let names = names(self.model.head, &self.options).into_iter();
+        let names = names(&self.options).into_iter();
         Some(Contents {
             guide: self.name().to_owned(),
             config: json!({
                 "dims": self.dims,
-                "options": json_options::to_map(&self.options),
+                "options": self.options.map,
                 "facts": self.facts,
             }),
             tensors: names.zip(tensors).map(|((n, s), v)| (n, s, v)).collect(),
@@ -300,7 +310,7 @@ impl Weighted {
     /// Weights are estimates of ∫f² that the directions can change, relative to the square of the mean in the tile of the
     /// image, as in the prediction of gains: else the network would serve the brightest part of it alone. Clipped at a
     /// quantile and scaled to mean 1.
-    fn new(records: &Records<'_>, usable: &[usize], options: &MixtureNetOptions) -> Self {
+    fn new(records: &Records<'_>, usable: &[usize], options: &NetOptions) -> Self {
         let stride = usable.len().div_ceil(options.max_rows).max(1);
         let tiles = HeldOut::new(*records);
         let weight = |row: usize| {

@@ -2,10 +2,10 @@
 
 use pulp::{Simd, WithSimd};
 
-use super::Kind;
 use super::mixture::Mixture;
 use super::mlp::{FEATURES, Mlp, Place};
-use super::options::MixtureNetOptions;
+use super::options::Options;
+use super::spline::Spline;
 use crate::Context;
 use crate::flow::kernel::{Linear, TILE};
 
@@ -14,47 +14,45 @@ use crate::flow::kernel::{Linear, TILE};
 pub(super) enum Head {
     /// One network, whose outputs decide both numbers.
     Mixture(Mixture),
+    /// Two networks, one a number.
+    Spline(Spline),
 }
 
 impl Head {
-    pub(super) fn new(kind: Kind, options: &MixtureNetOptions) -> Self {
-        match kind {
-            Kind::Mixture => Self::Mixture(Mixture {
-                components: options.components,
-            }),
-        }
-    }
-
     /// Networks, each of which may look at the numbers that those before it decided.
     pub(super) fn stages(self) -> usize {
         match self {
             Self::Mixture(_) => 1,
+            Self::Spline(_) => 2,
         }
     }
 
     pub(super) fn outputs(self) -> usize {
         match self {
             Self::Mixture(m) => m.outputs(),
+            Self::Spline(s) => s.outputs(),
         }
     }
 
     fn start(self) -> Vec<f32> {
         match self {
             Self::Mixture(m) => m.start(),
+            Self::Spline(s) => s.start(),
         }
     }
 
     fn scratch(self) -> usize {
         match self {
             Self::Mixture(m) => m.scratch(),
+            Self::Spline(s) => s.scratch(),
         }
     }
 
     /// Units of the layers of each network.
-    pub(super) fn widths(self, options: &MixtureNetOptions) -> Vec<Vec<usize>> {
+    pub(super) fn widths(self, hidden: usize, layers: usize) -> Vec<Vec<usize>> {
         let each = |stage| {
             let mut widths = vec![FEATURES + stage];
-            widths.extend(std::iter::repeat_n(options.hidden, options.layers));
+            widths.extend(std::iter::repeat_n(hidden, layers));
             widths.push(self.outputs());
             widths
         };
@@ -64,6 +62,7 @@ impl Head {
     #[inline(always)]
     fn sample(
         self,
+        stage: usize,
         rows: usize,
         out: &[f32],
         u: [&mut [f32]; 2],
@@ -72,28 +71,39 @@ impl Head {
     ) {
         match self {
             Self::Mixture(m) => m.sample(rows, out, u, q, scratch),
+            Self::Spline(s) => s.sample(rows, out, u[stage], q, scratch),
         }
     }
 
     #[inline(always)]
-    fn density(self, rows: usize, out: &[f32], u: [&[f32]; 2], q: &mut [f32], scratch: &mut [f32]) {
+    fn density(
+        self,
+        stage: usize,
+        rows: usize,
+        out: &[f32],
+        u: [&[f32]; 2],
+        q: &mut [f32],
+        scratch: &mut [f32],
+    ) {
         match self {
             Self::Mixture(m) => m.density(rows, out, u, q, scratch),
+            Self::Spline(s) => s.density(rows, out, u[stage], q, scratch),
         }
     }
 
     #[inline(always)]
     fn learn(
         self,
+        stage: usize,
         rows: usize,
         out: &[f32],
         u: [&[f32]; 2],
-        log_q: &mut [f32],
-        slope: &mut [f32],
+        [log_q, slope]: [&mut [f32]; 2],
         scratch: &mut [f32],
     ) {
         match self {
             Self::Mixture(m) => m.learn(rows, out, u, log_q, slope, scratch),
+            Self::Spline(s) => s.learn(rows, out, u[stage], log_q, slope, scratch),
         }
     }
 }
@@ -106,8 +116,9 @@ pub(super) struct Model {
 }
 
 impl Model {
-    pub(super) fn random(head: Head, options: &MixtureNetOptions, seed: u64) -> Self {
-        let widths = head.widths(options).into_iter().enumerate();
+    pub(super) fn random(options: &Options, seed: u64) -> Self {
+        let head = options.head;
+        let widths = options.widths().into_iter().enumerate();
         Self {
             head,
             nets: widths
@@ -116,11 +127,12 @@ impl Model {
         }
     }
 
-    /// ln q of each row of (n, 2) numbers for one stage's (n, outputs), and its derivative by the outputs, which it
-    /// replaces.
-    pub(super) fn learn(&self, out: &mut [f32], u: &[f32], log_q: &mut [f32]) {
+    /// Adds to `log_q` ln q of each row of (n, 2) numbers for one stage's (n, outputs), and replaces these by its
+    /// derivatives.
+    pub(super) fn learn(&self, stage: usize, out: &mut [f32], u: &[f32], log_q: &mut [f32]) {
         dispatch(Learn {
             head: self.head,
+            stage,
             out,
             u,
             log_q,
@@ -139,6 +151,7 @@ fn dispatch<O: WithSimd>(op: O) -> O::Output {
 
 struct Learn<'a> {
     head: Head,
+    stage: usize,
     out: &'a mut [f32],
     u: &'a [f32],
     log_q: &'a mut [f32],
@@ -163,8 +176,9 @@ impl WithSimd for Learn<'_> {
                 (u[0][r], u[1][r]) = (pair[0], pair[1]);
             }
             let pair = [&u[0][..], &u[1][..]];
+            let to = [&mut q[..], &mut slope[..]];
             self.head
-                .learn(rows, &block, pair, &mut q, &mut slope, &mut scratch);
+                .learn(self.stage, rows, &block, pair, to, &mut scratch);
             for (r, out) in out.chunks_exact_mut(n).enumerate() {
                 for (o, value) in out.iter_mut().enumerate() {
                     *value = slope[o * rows + r];
@@ -268,12 +282,12 @@ impl WithSimd for Pass<'_> {
                     let u = [&mut u0[..], &mut u1[..]];
                     model
                         .head
-                        .sample(rows, &ping, u, &mut density, &mut scratch);
+                        .sample(stage, rows, &ping, u, &mut density, &mut scratch);
                 } else {
                     let u = [&u0[..], &u1[..]];
                     model
                         .head
-                        .density(rows, &ping, u, &mut density, &mut scratch);
+                        .density(stage, rows, &ping, u, &mut density, &mut scratch);
                 }
                 q.iter_mut().zip(&density).for_each(|(q, d)| *q *= d);
             }

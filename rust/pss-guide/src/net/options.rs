@@ -1,9 +1,14 @@
-//! Options of the net.
+//! Options of the nets.
 
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
 use super::Kind;
+use super::mixture::Mixture;
+use super::model::Head;
+use super::spline::Spline;
+use crate::options::Rules;
 use crate::{GuideError, options};
 
 /// Rows that training looks at where nothing else is asked for: four thousand steps.
@@ -14,10 +19,45 @@ const MOST_EPOCHS: usize = 64;
 
 /// Options of `mixture-net`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct MixtureNetOptions {
     /// Normals of the mixture, 1 … 64. (Default: 8)
     pub components: usize,
+    /// Network and training.
+    #[serde(flatten)]
+    pub net: NetOptions,
+}
+
+impl Default for MixtureNetOptions {
+    fn default() -> Self {
+        Self {
+            components: 8,
+            net: NetOptions::default(),
+        }
+    }
+}
+
+/// Options of `spline-net`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct SplineNetOptions {
+    /// Bins of each number's spline, 2 … 64. (Default: 8)
+    pub bins: usize,
+    /// Networks and training.
+    #[serde(flatten)]
+    pub net: NetOptions,
+}
+
+impl Default for SplineNetOptions {
+    fn default() -> Self {
+        Self {
+            bins: 8,
+            net: NetOptions::default(),
+        }
+    }
+}
+
+/// Options that all nets have.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct NetOptions {
     /// Units of a hidden layer, 1 … 512. (Default: 32)
     pub hidden: usize,
     /// Hidden layers, 1 … 8. (Default: 2)
@@ -37,10 +77,9 @@ pub struct MixtureNetOptions {
     pub clip_quantile: f64,
 }
 
-impl Default for MixtureNetOptions {
+impl Default for NetOptions {
     fn default() -> Self {
         Self {
-            components: 8,
             hidden: 32,
             layers: 2,
             learning_rate: 5e-3,
@@ -53,19 +92,8 @@ impl Default for MixtureNetOptions {
     }
 }
 
-impl MixtureNetOptions {
-    /// `given` over the defaults, checked.
-    pub(super) fn parse(kind: Kind, given: &Map<String, Value>) -> Result<Self, GuideError> {
-        options::parse(kind.name(), &Self::default(), given)?.checked(kind.name())
-    }
-
-    fn checked(self, guide: &str) -> Result<Self, GuideError> {
-        let rules = options::Rules::new(guide, &self);
-        rules.check(
-            "components",
-            (1..=64).contains(&self.components),
-            "1 to 64 components",
-        )?;
+impl NetOptions {
+    fn check(&self, rules: &Rules<'_>) -> Result<(), GuideError> {
         rules.check("hidden", (1..=512).contains(&self.hidden), "1 to 512 units")?;
         rules.check(
             "layers",
@@ -101,8 +129,7 @@ impl MixtureNetOptions {
             "clip_quantile",
             options::positive(self.clip_quantile, 1.0),
             "a number in (0, 1]",
-        )?;
-        Ok(self)
+        )
     }
 
     /// Epochs over so many paths.
@@ -116,4 +143,57 @@ impl MixtureNetOptions {
         let rows = rows.min(self.max_rows);
         self.epochs(rows).saturating_mul(rows)
     }
+}
+
+/// Checked options of either net.
+#[derive(Clone, Debug)]
+pub(super) struct Options {
+    pub(super) head: Head,
+    pub(super) net: NetOptions,
+    /// All of them, as they are saved and shown.
+    pub(super) map: Map<String, Value>,
+}
+
+impl Options {
+    /// `given` over the defaults, checked.
+    pub(super) fn parse(kind: Kind, given: &Map<String, Value>) -> Result<Self, GuideError> {
+        match kind {
+            Kind::Mixture => {
+                let own: MixtureNetOptions = filled(kind, given)?;
+                let accepted = (1..=64).contains(&own.components);
+                let rules = Rules::new(kind.name(), &own);
+                rules.check("components", accepted, "1 to 64 components")?;
+                own.net.check(&rules)?;
+                let map = options::to_map(&own);
+                let head = Head::Mixture(Mixture {
+                    components: own.components,
+                });
+                let net = own.net;
+                Ok(Self { head, net, map })
+            }
+            Kind::Spline => {
+                let own: SplineNetOptions = filled(kind, given)?;
+                let accepted = (2..=64).contains(&own.bins);
+                let rules = Rules::new(kind.name(), &own);
+                rules.check("bins", accepted, "2 to 64 bins")?;
+                own.net.check(&rules)?;
+                let map = options::to_map(&own);
+                let head = Head::Spline(Spline { bins: own.bins });
+                let net = own.net;
+                Ok(Self { head, net, map })
+            }
+        }
+    }
+
+    /// Units of the layers of each network.
+    pub(super) fn widths(&self) -> Vec<Vec<usize>> {
+        self.head.widths(self.net.hidden, self.net.layers)
+    }
+}
+
+fn filled<T: Default + Serialize + DeserializeOwned>(
+    kind: Kind,
+    given: &Map<String, Value>,
+) -> Result<T, GuideError> {
+    options::parse(kind.name(), &T::default(), given)
 }

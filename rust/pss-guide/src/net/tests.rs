@@ -8,12 +8,13 @@ use serde_json::json;
 use super::Kind;
 use super::mlp::{FEATURES, Place};
 use super::model::{Head, Model, Packed};
-use super::options::MixtureNetOptions;
+use super::options::Options;
+use super::spline::Spline;
 use super::train::{self, Data};
 use crate::Context;
 use crate::flow::kernel::SLOPE;
 
-const KINDS: [Kind; 1] = [Kind::Mixture];
+const KINDS: [Kind; 2] = [Kind::Mixture, Kind::Spline];
 
 /// Sizes that are no multiple of any vector length among them.
 const SIZES: [(usize, usize, usize); 3] = [(6, 32, 2), (1, 5, 1), (3, 13, 3)];
@@ -23,14 +24,18 @@ fn uniform(n: usize, stream: u32) -> Vec<f32> {
     (0..n).map(|_| numbers.next_f32()).collect()
 }
 
-fn options((components, hidden, layers): (usize, usize, usize)) -> MixtureNetOptions {
-    let given = json!({ "components": components, "hidden": hidden, "layers": layers });
-    MixtureNetOptions::parse(Kind::Mixture, given.as_object().unwrap()).unwrap()
+fn options(kind: Kind, (parts, hidden, layers): (usize, usize, usize)) -> Options {
+    let mut given = json!({ "hidden": hidden, "layers": layers });
+    match kind {
+        Kind::Mixture => given["components"] = json!(parts),
+        Kind::Spline => given["bins"] = json!(parts + 1),
+    }
+    Options::parse(kind, given.as_object().unwrap()).unwrap()
 }
 
 /// A model with weights that are larger than any start of training, so that every layer bends.
-fn model(kind: Kind, options: &MixtureNetOptions) -> Model {
-    let mut model = Model::random(Head::new(kind, options), options, 5);
+fn model(options: &Options) -> Model {
+    let mut model = Model::random(options, 5);
     for (i, net) in model.nets.iter_mut().enumerate() {
         let last = net.tensors.len() - 2;
         let mut noise = uniform(1 << 16, 60 + i as u32).into_iter();
@@ -90,6 +95,48 @@ mod oracle {
         (sum.log()? + most)?.squeeze(1)
     }
 
+    /// Softmax with the least share added.
+    fn sizes(logits: &Tensor) -> Result<Tensor> {
+        let n = logits.dim(1)? as f64;
+        let shares = logits.exp()?;
+        let shares = shares.broadcast_div(&shares.sum_keepdim(D::Minus1)?)?;
+        (shares * (1.0 - 1e-3 * n))? + 1e-3
+    }
+
+    /// The formula of `spline`, the bin picked by masks.
+    fn spline(out: &Tensor, x: &Tensor) -> Result<Tensor> {
+        let bins = (out.dim(1)? - 1) / 3;
+        let part = |i: usize| out.narrow(1, i * bins, bins);
+        let (w, h) = (sizes(&part(0)?)?, sizes(&part(1)?)?);
+        let c = 1000f64.ln();
+        let slope = ((out.narrow(1, 2 * bins, bins + 1)? / c)?.tanh()? * c)?.exp()?;
+        let (mut at, mut before) = (Vec::new(), Vec::new());
+        for (w, x) in w.to_vec2::<f64>()?.iter().zip(x.to_vec2::<f64>()?) {
+            let mut begin = 0.0;
+            let begins = w.iter().map(|w| {
+                begin += w;
+                begin - w
+            });
+            let begins: Vec<f64> = begins.collect();
+            let bin = begins.iter().rposition(|b| x[0] >= *b).unwrap_or(0);
+            at.extend((0..bins).map(|j| f64::from(u8::from(j == bin))));
+            before.extend((0..bins).map(|j| f64::from(u8::from(j < bin))));
+        }
+        let mask = |m: Vec<f64>| Tensor::from_vec(m, (out.dim(0)?, bins), &Device::Cpu);
+        let (at, before) = (mask(at)?, mask(before)?);
+        let pick = |values: &Tensor, by: &Tensor| (values * by)?.sum_keepdim(D::Minus1);
+        let (width, s) = (pick(&w, &at)?, (pick(&h, &at)? / pick(&w, &at)?)?);
+        let xi = ((x - pick(&w, &before)?)? / width)?;
+        let rest = (xi.neg()? + 1.0)?;
+        let d = |from: usize| pick(&slope.narrow(1, from, bins)?, &at);
+        let (d0, d1, e) = (d(0)?, d(1)?, (&xi * &rest)?);
+        let n = (((&d1 * xi.sqr()?)? + ((&s * &e)? * 2.0)?)? + (&d0 * rest.sqr()?)?)?;
+        let t = ((d0 + d1)? - (&s * 2.0)?)?;
+        let m = (&s + (t * e)?)?;
+        let log = ((s.log()? * 2.0)? + n.log()?)?;
+        (log - (m.log()? * 2.0)?)?.squeeze(1)
+    }
+
     fn tensor(values: &[f32], shape: (usize, usize)) -> Result<Tensor> {
         let values: Vec<f64> = values.iter().map(|&x| f64::from(x)).collect();
         Tensor::from_vec(values, shape, &Device::Cpu)
@@ -122,6 +169,7 @@ mod oracle {
             let out = network(tensors, if stage == 0 { inputs.clone() } else { seen })?;
             let log = match model.head {
                 Head::Mixture(_) => mixture(&out, &u)?,
+                Head::Spline(_) => spline(&out, &u.narrow(1, stage, 1)?)?,
             };
             sum = (sum + log)?;
         }
@@ -145,8 +193,8 @@ fn gradients_agree_with_candle() {
     for kind in KINDS {
         for size in SIZES {
             for vertices in [1, 3] {
-                let options = options(size);
-                let (model, data) = (model(kind, &options), data(150, vertices));
+                let options = options(kind, size);
+                let (model, data) = (model(&options), data(150, vertices));
                 let paths: Vec<u32> = (0..150).collect();
                 let ours = train::gradient(&model, &data, &paths, 0.1);
                 let vars = oracle::vars(&model).unwrap();
@@ -199,8 +247,8 @@ const PLACE: Place = Place {
 fn evaluation_agrees_with_candle_in_any_batch() {
     for kind in KINDS {
         for size in SIZES {
-            let options = options(size);
-            let model = model(kind, &options);
+            let options = options(kind, size);
+            let model = model(&options);
             let packed = Packed::new(&model, PLACE);
             let n = 203;
             let (contexts, u) = (contexts(n), uniform(2 * n, 9));
@@ -231,8 +279,8 @@ fn evaluation_agrees_with_candle_in_any_batch() {
 #[test]
 fn samples_invert_the_distribution_function() {
     for kind in KINDS {
-        let options = options((4, 8, 1));
-        let packed = Packed::new(&model(kind, &options), PLACE);
+        let options = options(kind, (4, 8, 1));
+        let packed = Packed::new(&model(&options), PLACE);
         let context = contexts(1)[0];
         let n = 1000;
         // At a fixed first number the second one's map is monotone; its slope is 1 ÷ the conditional density.
@@ -244,6 +292,125 @@ fn samples_invert_the_distribution_function() {
             assert!(q.iter().all(|q| q.is_finite() && *q > 0.0), "{q:?}");
             let seconds: Vec<f32> = u.chunks_exact(2).map(|u| u[1]).collect();
             assert!(seconds.is_sorted(), "{kind:?}: {seconds:?}");
+        }
+    }
+}
+
+/// F and ln q of one number, in f64 and straight from the paper's eqs. 4 and 5: the bin's x_k, y_k, δ_k by running sums.
+fn exact_spline(out: &[f64], x: f64) -> (f64, f64) {
+    let n = (out.len() - 1) / 3;
+    let sizes = |logits: &[f64]| -> Vec<f64> {
+        let sum: f64 = logits.iter().map(|l| l.exp()).sum();
+        let size = |l: &f64| 1e-3 + (1.0 - 1e-3 * n as f64) * l.exp() / sum;
+        logits.iter().map(size).collect()
+    };
+    let (w, h) = (sizes(&out[..n]), sizes(&out[n..2 * n]));
+    let c = 1000f64.ln();
+    let slope = |k: usize| (c * (out[2 * n + k] / c).tanh()).exp();
+    let (mut k, mut begin, mut below) = (0, 0.0, 0.0);
+    while k + 1 < n && begin + w[k] <= x {
+        begin += w[k];
+        below += h[k];
+        k += 1;
+    }
+    let (s, xi) = (h[k] / w[k], (x - begin) / w[k]);
+    let (d0, d1) = (slope(k), slope(k + 1));
+    let top = d1 * xi * xi + 2.0 * s * xi * (1.0 - xi) + d0 * (1.0 - xi).powi(2);
+    let bottom = s + (d1 + d0 - 2.0 * s) * xi * (1.0 - xi);
+    let share = (s * xi * xi + d0 * xi * (1.0 - xi)) / bottom;
+    (below + h[k] * share, (s * s * top / (bottom * bottom)).ln())
+}
+
+/// Claim: ln q of a spline and its derivative by every output agree with central differences in f64 to 1e-4 of 1 + |·|,
+/// for outputs so large that bins are as narrow and slopes as steep as they may be, and at both ends of the interval.
+/// Where bins begin is a sum in f32: x may be taken for one 3e-7 away.
+#[test]
+fn a_splines_derivatives_are_central_differences() {
+    for (bins, gain) in [(2, 1.0), (5, 3.0), (8, 6.0), (16, 12.0)] {
+        let spline = Spline { bins };
+        let (n, rows) = (spline.outputs(), 8);
+        let mut x = uniform(rows, 20);
+        (x[0], x[1], x[2]) = (0.0, 1.0 - f32::EPSILON / 2.0, f32::MIN_POSITIVE);
+        let number = |u: &f32| gain * (2.0 * u - 1.0);
+        let out: Vec<f32> = uniform(n * rows, 21).iter().map(number).collect();
+        let (mut log, mut slope) = (vec![0.0; rows], vec![0.0; n * rows]);
+        let mut scratch = vec![0.0; spline.scratch() * rows];
+        spline.learn(rows, &out, &x, &mut log, &mut slope, &mut scratch);
+        for (r, &x) in x.iter().enumerate() {
+            let mut own: Vec<f64> = (0..n).map(|o| f64::from(out[o * rows + r])).collect();
+            let near = [-3e-7, 0.0, 3e-7].map(|by| f64::from(x) + by);
+            let close = |a: f32, b: [f64; 3]| {
+                let low = b.into_iter().fold(f64::INFINITY, f64::min);
+                let high = b.into_iter().fold(f64::NEG_INFINITY, f64::max);
+                let slack = 1e-4 * (1.0 + b[1].abs());
+                (low - slack..=high + slack).contains(&f64::from(a))
+            };
+            let want = near.map(|x| exact_spline(&own, x).1);
+            assert!(
+                close(log[r], want),
+                "{bins} bins at {x}: {} {want:?}",
+                log[r]
+            );
+            for o in 0..n {
+                let value = own[o];
+                let numeric = near.map(|x| {
+                    let mut moved = |by: f64| {
+                        own[o] = value + by;
+                        exact_spline(&own, x).1
+                    };
+                    (moved(1e-6) - moved(-1e-6)) / 2e-6
+                });
+                own[o] = value;
+                let ours = slope[o * rows + r];
+                assert!(
+                    close(ours, numeric),
+                    "{bins} bins at {x}, output {o}: {ours}, not {numeric:?}"
+                );
+            }
+        }
+    }
+}
+
+/// Claim: for steep and flat splines alike the distribution function of a sample is the number that it was made of, to 2e-6
+/// and what a step of 3e-7 in x changes (f32's in the sums over bins); its slope is the density reported.
+#[test]
+fn a_splines_samples_invert_its_distribution_function() {
+    for (bins, gain) in [(2, 1.0), (8, 3.0), (16, 12.0)] {
+        let spline = Spline { bins };
+        let (n, rows) = (spline.outputs(), 8);
+        let number = |u: &f32| gain * (2.0 * u - 1.0);
+        let one: Vec<f32> = uniform(n, 22).iter().map(number).collect();
+        let out: Vec<f32> = one.iter().flat_map(|&o| vec![o; rows]).collect();
+        let own: Vec<f64> = one.iter().map(|&o| f64::from(o)).collect();
+        let mut scratch = vec![0.0; spline.scratch() * rows];
+        let even: Vec<f32> = (0..400).map(|i| i as f32 / 400.0).collect();
+        let before = [&even[..], &[1.0 - f32::EPSILON / 2.0; 8]].concat();
+        let (mut all, mut q) = (before.clone(), vec![0.0; before.len()]);
+        for (u, q) in all.chunks_exact_mut(rows).zip(q.chunks_exact_mut(rows)) {
+            spline.sample(rows, &out, u, q, &mut scratch);
+            let mut again = vec![0.0; rows];
+            spline.density(rows, &out, u, &mut again, &mut scratch);
+            for (a, b) in q.iter().zip(&again) {
+                assert!((a / b - 1.0).abs() < 1e-4, "{a} {b}");
+            }
+        }
+        assert!(all.is_sorted() && all.iter().all(|x| (0.0..1.0).contains(x)));
+        for ((&x, &v), &q) in all.iter().zip(&before).zip(&q) {
+            let at = |by: f64| exact_spline(&own, f64::from(x) + by).0;
+            let want = f64::from(v) + 2f64.powi(-25);
+            let slack = 2e-6 + at(3e-7) - at(-3e-7);
+            assert!(
+                (at(0.0) - want).abs() < slack,
+                "{bins} bins: F({x}) = {}, not {want}",
+                at(0.0)
+            );
+            let near = [-3e-7, 0.0, 3e-7].map(|by| (at(by + 1e-8) - at(by - 1e-8)) / 2e-8);
+            let low = near.into_iter().fold(f64::INFINITY, f64::min);
+            let high = near.into_iter().fold(0.0, f64::max);
+            assert!(
+                (0.999 * low..=1.001 * high).contains(&f64::from(q)),
+                "{bins} bins at {x}: {q} {near:?}"
+            );
         }
     }
 }

@@ -10,7 +10,7 @@ use rayon::prelude::*;
 
 use super::mlp::FEATURES;
 use super::model::Model;
-use super::options::MixtureNetOptions;
+use super::options::NetOptions;
 use crate::{EpochLoss, GuideError};
 
 /// Decisions in one part of a batch.
@@ -46,7 +46,7 @@ pub(super) struct Gradient {
 /// Trains `model`; `progress` gets the share done and returns false to cancel.
 pub(super) fn train(
     guide: &str,
-    options: &MixtureNetOptions,
+    options: &NetOptions,
     model: &mut Model,
     data: &Data,
     seed: u64,
@@ -168,7 +168,7 @@ fn add_part(
         }
         net.forward(n, acts);
         if let Some(out) = acts.last_mut() {
-            model.learn(out, &u, &mut log_q);
+            model.learn(stage, out, &u, &mut log_q);
         }
     }
     // d/d ln q of w/m is −w (1 − a) q/m², the same for each decision of a path.

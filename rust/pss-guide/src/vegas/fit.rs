@@ -257,7 +257,7 @@ mod tests {
         let options = VegasOptions {
             iterations: 60,
             bins: 8,
-            condition: super::super::options::Condition::None,
+            condition: crate::Condition::None,
             ..VegasOptions::default()
         };
         let grid = fit(&options, &records, &mut rows, &mut |_| true).unwrap();

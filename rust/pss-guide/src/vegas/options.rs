@@ -4,17 +4,8 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
 use super::NAME;
-use crate::{GuideError, options};
-
-/// What a whole-path guide looks at.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Condition {
-    /// Nothing: one density for the whole image.
-    None,
-    /// The film position.
-    Pixel,
-}
+use crate::GuideError;
+use crate::options::{self, Condition};
 
 /// Options of `vegas`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

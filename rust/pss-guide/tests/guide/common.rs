@@ -230,7 +230,7 @@ pub(crate) fn chi_square(guide: &dyn Guide, case: Case, wrong: f64) -> f64 {
     const CELLS: usize = 16;
     let (n, width) = (200_000, case.width);
     // Bins whose borders are anywhere: points within their squares at random, so that what one misses another finds.
-    let jittered = guide.name() == "vegas";
+    let jittered = ["vegas", "spline-net"].contains(&guide.name());
     let inner = match width {
         1 => 2000,
         _ if jittered => 64,

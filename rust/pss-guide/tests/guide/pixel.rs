@@ -123,3 +123,32 @@ fn pixels_that_are_nowhere_are_harmless() {
         }
     }
 }
+
+/// When a whole path is drawn its vertices are not known yet: what a context says of them changes no bit.
+#[test]
+fn vertices_are_not_read() {
+    for name in conditioned() {
+        let guide = fitted(name, "pixel").guide;
+        assert!(guide.looks_at_contexts(Decision::Path));
+        let n = 500;
+        let bits = |position: f32| {
+            let pixels = common::uniform(n, 2, 306);
+            let context = |&pixel| Context {
+                position: [position; 3],
+                normal: [position; 3],
+                outgoing: [position; 3],
+                pixel,
+                emitter: 7,
+                bounce: 3,
+            };
+            let contexts: Vec<Context> = pixels.as_chunks().0.iter().map(context).collect();
+            let (mut u, mut q) = (common::uniform(n, 2, 307), vec![0.0; n]);
+            guide.sample(Decision::Path, &contexts, &mut u, &mut q);
+            let mut again = vec![0.0; n];
+            guide.density(Decision::Path, &contexts, &u, &mut again);
+            let all = u.into_iter().chain(q).chain(again);
+            all.map(f32::to_bits).collect::<Vec<_>>()
+        };
+        assert_eq!(bits(0.0), bits(f32::NAN), "{name}");
+    }
+}

@@ -7,7 +7,11 @@ use crate::common::{self, cases, options};
 use crate::world::{Paths, World};
 
 /// Guides of every decision: one for each that models directions by place.
-const ALL: [&str; 2] = ["table", "mixture-net+emitter-table+light-table"];
+const ALL: [&str; 3] = [
+    "table",
+    "mixture-net+emitter-table+light-table",
+    "spline-net+emitter-table+light-table",
+];
 
 fn fitted(name: &str, paths: &Paths) -> Box<dyn Guide> {
     fit(name, &Map::new(), &paths.records(), 1, &mut |_| true)
@@ -57,6 +61,7 @@ fn each_guide_gains_alone_and_more_bounces_gain_more() {
     for (name, least) in [
         ("direction-table", 2.0),
         ("mixture-net", 2.0),
+        ("spline-net", 2.0),
         ("emitter-table", 1.15),
         ("light-table", 1.3),
         ("table", 8.0),
