@@ -127,7 +127,11 @@ def define() -> Callable[[Any], Any]:
             em_pdf = scene.pdf_emitter_direction(si, ds, active & (delta ^ True))
             emitted = _emitted(hit.emitter(scene, active), hit, active)
             mis = _mis_weight(bs.pdf, dr.select(delta, 0.0, em_pdf))
-            return radiance + dr.select(active, throughput * emitted * mis, mi.Spectrum(0.0)), valid, []
+            return (
+                radiance + dr.select(active, throughput * emitted * mis, mi.Spectrum(0.0)),
+                valid,
+                [],
+            )
 
         def to_string(self) -> str:
             """As Mitsuba prints its own."""

@@ -229,9 +229,7 @@ class Study:
             )
         return True
 
-    def _common(
-        self, name: str, case: Case, method: Method, seed: int, key: str
-    ) -> dict[str, Any]:
+    def _common(self, name: str, case: Case, method: Method, seed: int, key: str) -> dict[str, Any]:
         import mitsuba as mi
 
         return {
@@ -263,6 +261,14 @@ class Study:
                 layers["variance"] = shot.variance
             path = image_path(self.folder, name, method.name, seed, shot.time)
             _core.write_exr(str(path), layers)
+
+    def image_path(self, row: Row) -> Path:
+        """Where a row's image lies; of seeds after the first only the last one is kept."""
+        return image_path(self.folder, row.scene, row.method, row.seed, row.time)
+
+    def reference_path(self, scene: str) -> Path:
+        """Where a scene's truth lies."""
+        return reference_path(self.folder, scene)
 
     def floors(self) -> dict[tuple[str, str], metrics.Estimate]:
         """The squared bias that the last images of several seeds have in common, by scene and method."""
