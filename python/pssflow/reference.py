@@ -1,14 +1,14 @@
 """Mitsuba's own truth for light of exactly k bounces, in passes, cached and resumed.
 
 The truth is `path` with max_depth k + 1 minus `path` with max_depth k, the same film and filter, no Russian roulette
-before depth k + 2 (`TruthPass`): that is what tests compare with. In LLVM variants both are rendered from the same seed:
-they share all random numbers up to the last bounce, so that the common terms cancel exactly. In `scalar_rgb` the streams
-part ways, and the truth needs far more samples.
+before depth k + 2 (`TruthPass`): that is what tests compare with. In LLVM variants both are rendered from one seed:
+they share all random numbers up to the last bounce, so that the common terms cancel exactly. In `scalar_rgb` the
+streams part ways, and the truth needs far more samples.
 
-A reference for studies need not render the directly lit scene twice, only to throw it away: in LLVM variants it is
-rendered by `pssflow_kbounce` (`KBouncePass`), Mitsuba's path tracer cut down to light of k bounces, whose mean is that
-difference (`tests/statistical/test_kbounce.py`), at half the time and the same variance. Hidden emitters it does not know:
-there, and in `scalar_rgb`, where it would be Python's speed that counts, the difference remains.
+A reference need not render the directly lit scene twice, only to throw it away: in LLVM variants it is rendered by
+`pssflow_kbounce` (`KBouncePass`), Mitsuba's path tracer cut down to light of k bounces, whose mean is that difference
+(`tests/statistical/test_kbounce.py`), at half the time and the same variance. Hidden emitters it does not know: there,
+and in `scalar_rgb`, where it would be Python's speed that counts, the difference remains.
 
 Either is averaged over passes of other seeds; their spread gives each pixel's variance of the mean.
 """
@@ -273,6 +273,7 @@ class Running:
 
     @classmethod
     def empty(cls, size: list[int], spp_per_pass: int) -> Running:
+        """Before the first pass, of an image of (width, height)."""
         shape = (size[1], size[0], 3)
         return cls(np.zeros(shape), np.zeros(shape), 0, spp_per_pass, 0.0, 0, 0)
 
@@ -295,6 +296,7 @@ class Running:
         return self.m2 / max((self.passes - 1) * self.passes, 1)
 
     def standard_error(self) -> float:
+        """Relative standard error of the mean, as `Reference.standard_error`."""
         return metrics.relative_error(self.variance(), self.mean)
 
 
@@ -325,6 +327,7 @@ class _Pass:
         return image, self.camera.sampler().sample_count(), int(np.count_nonzero(bad))
 
     def _render(self, seed: int, spp: int) -> F64:
+        """The image, with whatever is in it."""
         raise NotImplementedError
 
     def restore(self) -> None:

@@ -19,8 +19,8 @@ walk of k − 1 BSDF samples, then one emitter sample and one BSDF sample at x_k
 null lobes count as bounces and take part as they do there; there is no Russian roulette. It draws no learned number and
 knows nothing of pssflow's core: it is the competitor of our studies, and in LLVM variants their reference.
 
-It works badly where BSDF sampling finds little light: that is what guides are for. In ``scalar_rgb`` Python is called for
-every path, which takes far longer than the path itself. Nothing is differentiated.
+It works badly where BSDF sampling finds little light: that is what guides are for. In ``scalar_rgb`` Python is called
+for every path, which takes far longer than the path itself. Nothing is differentiated.
 
 .. tabs::
     .. code-tab:: xml
@@ -122,16 +122,15 @@ def define() -> Callable[[Any], Any]:
             active &= dr.any(throughput != 0.0)
             ray = si.spawn_ray(si.to_world(bs.wo))
             hit = scene.ray_intersect(ray, mi.RayFlags.All, False, active)
+            emitter = hit.emitter(scene, active)
+            if scalar and emitter is None:
+                return radiance, valid, []
             ds = mi.DirectionSample3f(scene, hit, si)
             delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
             em_pdf = scene.pdf_emitter_direction(si, ds, active & (delta ^ True))
-            emitted = _emitted(hit.emitter(scene, active), hit, active)
             mis = _mis_weight(bs.pdf, dr.select(delta, 0.0, em_pdf))
-            return (
-                radiance + dr.select(active, throughput * emitted * mis, mi.Spectrum(0.0)),
-                valid,
-                [],
-            )
+            met = throughput * emitter.eval(hit, active) * mis
+            return radiance + dr.select(active, met, mi.Spectrum(0.0)), valid, []
 
         def to_string(self) -> str:
             """As Mitsuba prints its own."""
@@ -145,8 +144,3 @@ def _mis_weight(a: Any, b: Any) -> Any:
     a, both = a * a, a * a + b * b
     weight = a / dr.select(both > 0.0, both, 1.0)
     return dr.select(dr.isfinite(weight), weight, 0.0)
-
-
-def _emitted(emitter: Any, hit: Any, active: Any) -> Any:
-    """Radiance towards where the ray came from. A scalar variant says None where there is no emitter."""
-    return mi.Spectrum(0.0) if emitter is None else emitter.eval(hit, active)

@@ -107,8 +107,8 @@ class Study:
         methods: the methods.
         times: seconds, increasing; a run goes to the last.
         seeds: numbers of the seeds.
-        settings: what all runs share, for the rows and the configuration's hash: `k`, `emitter_strategy`, `threads`, and
-            whatever else decides a row, as `reference_time`.
+        settings: what all runs share, for the rows and the configuration's hash: `k`, `emitter_strategy`, `threads`,
+            and whatever else decides a row, as `reference_time`.
         say: told what is being done.
         progress: as in `pssflow.render`.
         publish: called with the rows so far after each scene.

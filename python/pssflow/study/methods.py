@@ -1,14 +1,14 @@
 """Methods of the studies by name: pssflow's guides, Mitsuba's path tracer, and a guide of another make.
 
-| name             | what it is                                                                                     |
-|------------------|------------------------------------------------------------------------------------------------|
-| `none`, `auto`, … | a guide of `pssflow.guide.guide_names()`                                                      |
-| `mitsuba-llvm`   | `pssflow_kbounce` in `llvm_ad_rgb`: Mitsuba's path tracer, for k-bounce light only             |
-| `mitsuba-scalar` | the same in `scalar_rgb`, where Python is called for every path: that is what its time goes into |
-| `python-vegas`   | Lepage's own package `vegas`, as a guide of pssflow by `guide=` object                         |
+| name              | what it is                                                                           |
+|-------------------|--------------------------------------------------------------------------------------|
+| `none`, `auto`, … | a guide of `pssflow.guide.guide_names()`                                             |
+| `mitsuba-llvm`    | `pssflow_kbounce` in `llvm_ad_rgb`: Mitsuba's path tracer, for k-bounce light only   |
+| `mitsuba-scalar`  | the same in `scalar_rgb`, where Python is called for every path and takes most of it |
+| `python-vegas`    | Lepage's own package `vegas`, as a guide of pssflow by `guide=` object               |
 
-All of them join the light with MIS. A difference of two renders is none: it would render the directly lit scene as well,
-only to throw it away.
+All of them join the light with MIS. A difference of two renders is none: it would render the directly lit scene as
+well, only to throw it away.
 """
 
 from __future__ import annotations

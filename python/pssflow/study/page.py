@@ -1,7 +1,7 @@
 """report.html of a study: tables, charts and an image viewer in one file that opens from disk without a network.
 
-Images and charts lie in the page as data URIs. The viewer shows, scene by scene, what each method had: the image under one
-exposure, or its error in false colours (relMSE's squared relative error of a pixel, on a logarithmic scale).
+Images and charts lie in the page as data URIs. The viewer shows, scene by scene, what each method had: the image under
+one exposure, or its error in false colours (relMSE's squared relative error of a pixel, on a logarithmic scale).
 """
 
 from __future__ import annotations

@@ -23,13 +23,14 @@ from .summary import BASELINE, CLOSE, Cell, Choice, Overall, cells, choices, ove
 __all__ = ["biased", "publish"]
 
 NOTES = """\
-relMSE, and the variance that an image says of itself, are relative to the reference (docs of pssflow.metrics); of relMSE
-the reference's own variance is subtracted, * lies below it. “trimmed” leaves out the worst 0.1 % of pixels, which hides
-fireflies. MAPE and FLIP (HDR-FLIP's mean, 0 … 1) hold the reference's noise. variance × time: the image's own, in seconds.
-Ratios are those of random sampling (none) ÷ the method: above 1 is a gain; but cost is the method's ÷ random's. gain / path:
-the images' own variance; equal samples and equal time: relMSE; cost: seconds a path with pilot and training inside.
-± is one standard error over seeds; win and loss are beyond two. A time shorter than the run is a snapshot of it: its pilot
-was planned for the whole."""
+relMSE, and the variance that an image says of itself, are relative to the reference (docs of pssflow.metrics); of
+relMSE the reference's own variance is subtracted, * lies below it. “trimmed” leaves out the worst 0.1 % of pixels,
+which hides fireflies. MAPE and FLIP (HDR-FLIP's mean, 0 … 1) hold the reference's noise. variance × time: the image's
+own, in seconds. Time to an error: where the line of means over seeds crosses it on logarithmic axes, never beyond what
+was measured. Ratios are those of random sampling (none) ÷ the method: above 1 is a gain; but cost is the method's ÷
+random's. gain / path: the images' own variance; equal samples and equal time: relMSE; cost: seconds a path with pilot
+and training inside. ± is one standard error over seeds; win and loss are beyond two. A time shorter than the run is a
+snapshot of it: its pilot was planned for the whole."""
 
 MEASURES = {
     "relmse": ("error", "Error against time", "relMSE"),
@@ -53,6 +54,8 @@ class Sheet:
     rows: Sequence[Sequence[str]]
     texts: int = 2
     """Columns that hold words."""
+    summary: bool = False
+    """Whether a page begins with it."""
 
 
 def publish(study: Study, rows: Sequence[Row], title: str) -> list[Any]:
@@ -188,7 +191,7 @@ def _sums(total: Sequence[Overall]) -> Sheet:
         ]
         for o in total
     ]
-    return Sheet("Summary: random sampling ÷ the method", headings, table)
+    return Sheet("Summary: random sampling ÷ the method", headings, table, summary=True)
 
 
 def _charts(

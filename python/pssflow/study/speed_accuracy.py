@@ -1,7 +1,7 @@
-"""`pssflow study speed-accuracy`: error against wall time of guides, of Mitsuba and of others; `make study-speed-accuracy`.
+"""`pssflow study speed-accuracy`: error against wall time of guides, Mitsuba and others; `make study-speed-accuracy`.
 
-As `pssflow study guides`, with more times and with competitors: Mitsuba's path tracer for k-bounce light, and a guide of
-another make. What each time counts stands in every row (`budget`).
+As `pssflow study guides`, with more times and with competitors: Mitsuba's path tracer for k-bounce light, and a guide
+of another make. What each time counts stands in every row (`budget`).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ STANDARD = ("none", "table", "auto", "mitsuba-llvm", "python-vegas")
 
 
 def standard(full: bool) -> list[str]:
-    """The standard set; with `full` all guides and Mitsuba's scalar variant, in which Python's own speed is measured."""
+    """The standard set; with `full` all guides, and Mitsuba's scalar variant, where Python's own speed is measured."""
     if not full:
         return list(STANDARD)
     from .guides import standard as guides

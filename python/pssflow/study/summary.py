@@ -281,8 +281,8 @@ def time_to_reach(
 ) -> tuple[float | None, str]:
     """Seconds at which an error that falls through `points` (seconds, error) first comes to `target`.
 
-    Both are interpolated on logarithmic axes, where errors fall in straight lines; nothing is extrapolated, and nothing is
-    read below `floor`, the reference's own noise in the same measure.
+    Both are interpolated on logarithmic axes, where errors fall in straight lines; nothing is extrapolated, and nothing
+    is read below `floor`, the reference's own noise in the same measure.
 
     Returns:
         The seconds and an empty text, or None and what is known instead, as `Reach.bound`.
@@ -310,7 +310,7 @@ def time_to_reach(
 
 
 def targets(found: Sequence[Cell], scene: str) -> list[float]:
-    """Errors worth asking for on a scene: what random sampling (or the first method) has after each time, largest first.
+    """Errors worth asking for on a scene, largest first: those of random sampling (or the first method) at each time.
 
     Rounded up to two digits, so that they can be read, and left out below the reference's noise.
     """

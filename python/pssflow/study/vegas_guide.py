@@ -80,7 +80,7 @@ class VegasGuide:
 
 
 def _inverse(grid: Any, x: F64) -> tuple[F64, F64]:
-    """y (n, 1) and dx/dy (n,) of points x (n, 1)."""
+    """For points x (n, 1): y (n, 1) and dx/dy (n,)."""
     x = np.ascontiguousarray(x)
     y, jacobian = np.empty_like(x), np.empty(len(x))
     grid.invmap(x, y, jacobian)
