@@ -111,7 +111,7 @@ class Study:
             and whatever else decides a row, as `reference_time`.
         say: told what is being done.
         progress: as in `pssflow.render`.
-        publish: called with the rows so far after each scene.
+        publish: called with the rows so far after each scene but the last, and on Ctrl-C.
     """
 
     folder: Path
@@ -165,7 +165,8 @@ class Study:
                     clock.skip(len(self.methods) * len(self.seeds))
                     continue
                 self._digests[scenery.name] = case.digest
-                if self._scene(scenery.name, case, clock):
+                ran = self._scene(scenery.name, case, clock)
+                if ran and scenery is not self.sceneries[-1]:
                     self.publish(self.rows)
         except KeyboardInterrupt:
             self.publish(self.rows)

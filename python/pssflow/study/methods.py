@@ -43,6 +43,9 @@ OTHERS = (*MITSUBA, VEGAS)
 PATHS_PER_PASS = 1 << 18
 """Of Mitsuba, about: a wavefront that is worth its overhead, and many to a second."""
 
+SHARE_OF_FIRST = 0.25
+"""Of the shortest time that a pass may take, if its samples can be fewer: what does not fit any more is lost."""
+
 
 @dataclass
 class Stage:
@@ -192,14 +195,21 @@ def _passes(
     # References count from 0, and must not share a number with what they measure.
     first = (seed + 1) << 20
     start = time.perf_counter()
-    if render.jit:
-        # The first compiles, the second tells how long a pass takes.
+    longest = 0.0
+
+    def measure(spp: int) -> float:
+        """Seconds of a pass: its first one compiles, its second one tells."""
         render(first - 1, spp)
         begun = time.perf_counter()
         render(first - 2, spp)
-        longest = time.perf_counter() - begun
-    else:
-        longest = 0.0
+        return time.perf_counter() - begun
+
+    if render.jit:
+        longest = measure(spp)
+        fitting = SHARE_OF_FIRST * times[0] / longest if longest > 0.0 else 1.0
+        if fitting < 1.0 and spp > 1:
+            spp = max(int(spp * fitting), 1)
+            longest = measure(spp)
     warm_up = time.perf_counter() - start
     state = Running.empty([scene.width, scene.height], spp)
     elapsed = 0.0
