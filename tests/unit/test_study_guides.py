@@ -305,7 +305,7 @@ def test_tables_and_charts_are_written(tmp_path, slowly):
     assert shown[-1].startswith("wrote ")
 
 
-@pytest.mark.usefixtures("llvm_variant", "slowly")
+@pytest.mark.usefixtures("llvm_variant")
 @pytest.mark.parametrize(
     ("name", "methods"),
     [("guides", "none,table"), ("speed-accuracy", "none,mitsuba-llvm,python-vegas")],
