@@ -45,7 +45,8 @@ def _load(name: str) -> Any:
 
 def _kbounce_runs(scene: Any, *, k: int, seeds: range, spp: int) -> Runs:
     integrator: Any = mi.load_dict({"type": "pssflow_kbounce", "k": k})
-    images = [np.array(mi.render(scene, integrator=integrator, spp=spp, seed=s)) for s in seeds]
+    render: Any = mi.render
+    images = [np.array(render(scene, integrator=integrator, spp=spp, seed=s)) for s in seeds]
     return np.stack(images)[..., :3]
 
 

@@ -38,7 +38,7 @@ def test_a_reference_is_the_mean_over_passes(llvm_variant, tmp_path):
     assert found.path != shorter.path
     scene = mi.load_dict(scenes.furnace_sphere())
     integrator: Any = mi.load_dict({"type": "pssflow_kbounce"})
-    images = [np.array(mi.render(scene, integrator=integrator, seed=s, spp=8)) for s in range(4)]
+    images = [np.array(integrator.render(scene, seed=s, spp=8)) for s in range(4)]
     np.testing.assert_allclose(shorter.image, np.mean(images, 0)[..., :3], atol=1e-5)
     assert found.passes == module.LEAST_PASSES
     assert found.spp == 8 * found.passes

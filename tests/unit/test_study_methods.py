@@ -12,6 +12,7 @@ import pytest
 import pssflow
 from pssflow.study import methods
 from pssflow.study.flip import flip
+from pssflow.study.harness import Shot
 from pssflow.study.methods import Stage, missing, named_method
 from pssflow.study.vegas_guide import VegasGuide
 from tests import scenes
@@ -37,7 +38,7 @@ def clock(monkeypatch) -> list[float]:
     return now
 
 
-def passes(render: FakePass, times: tuple[float, ...], seed: int = 0) -> list[methods.Shot]:
+def passes(render: FakePass, times: tuple[float, ...], seed: int = 0) -> list[Shot]:
     scene: Any = SimpleNamespace(width=2, height=2)
     return methods._passes(render, "fake", seed, scene, times, None)  # pyright: ignore[reportArgumentType]
 
@@ -135,7 +136,7 @@ def test_vegas_guides_a_render(llvm_variant):
     """The mean stays; its object is new in each run, so that seeds share nothing."""
     scene = pssflow.Scene(scenes.furnace_sphere())
     method = named_method("python-vegas", k=2, threads=None)
-    (shot,) = method.run(Stage(scene, mi.load_dict), 1, (1.0,), False)
+    (shot,) = method.run(Stage(scene, lambda variant: scene.mi_scene), 1, (1.0,), False)
     expected = scene.render("none", 64, progress=False).image.mean()
     assert shot.image.mean() == pytest.approx(expected, rel=0.1)
     assert "vegas" in method.options

@@ -17,6 +17,7 @@ import pytest
 from PIL import Image
 
 from pssflow import metrics
+from pssflow.reference import read_exr
 from pssflow.study import harness, page, report
 from pssflow.study.charts import error_chart
 from pssflow.study.harness import Study
@@ -103,9 +104,9 @@ def test_images_and_errors_are_those_of_the_exrs(done, text):
     assert [len(scene["views"]) for scene in data["scenes"]] == [7, 7]  # a reference, 3 × 2 times
     scene = data["scenes"][0]
     views = {(view["name"], view["time"]): view for view in scene["views"]}
-    truth = page.read_exr(done.reference_path("scene 0")).image
+    truth = read_exr(done.reference_path("scene 0")).image
     row = next(r for r in done.rows if (r.method, r.seed, r.time) == ("none", 0, 4.0))
-    image = page.read_exr(done.image_path(row)).image
+    image = read_exr(done.image_path(row)).image
     view = views["none", 4.0]
     assert _decoded(view["image"]).shape == (64, 64, 3)
     grey = _decoded(view["error"]).astype(float)
@@ -114,7 +115,9 @@ def test_images_and_errors_are_those_of_the_exrs(done, text):
     error = ((image - truth) ** 2 / (truth**2 + metrics.epsilon(truth))).mean(axis=2)
     lit = (error > 10**low) & (error < 10**high)
     step = (high - low) / (page.LEVELS - 1)
-    assert np.abs(np.log10(shown[lit] / error[lit])).max() < 0.7 * step  # rounded to a level, and that to a byte
+    assert (
+        np.abs(np.log10(shown[lit] / error[lit])).max() < 0.7 * step
+    )  # rounded to a level, and that to a byte
     assert views["reference", None]["error"] is None
     assert "32 spp" in view["text"]
 

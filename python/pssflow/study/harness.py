@@ -305,6 +305,7 @@ def measured(shot: Shot, truth: Reference, common: Mapping[str, Any]) -> Row:
     own = None
     if shot.variance is not None and np.isfinite(shot.variance).all():
         own = metrics.finite_or_none(metrics.relative_variance(shot.variance, truth.image))
+    phases: dict[str, Any] = {f"seconds_{phase}": shot.seconds.get(phase) for phase in PHASES}
     error = metrics.relmse_with_error(shot.image, truth.image, truth.variance)
     return Row(
         **common,
@@ -315,7 +316,7 @@ def measured(shot: Shot, truth: Reference, common: Mapping[str, Any]) -> Row:
         height=height,
         spp=shot.spp,
         paths=shot.spp * width * height,
-        **{f"seconds_{phase}": shot.seconds.get(phase) for phase in PHASES},
+        **phases,
         nonzero_share=shot.nonzero_share,
         relmse=error.value,
         relmse_error=error.error,
@@ -332,6 +333,7 @@ def nothing_yet(
     time: float, size: tuple[int, int], truth: Reference, common: Mapping[str, Any]
 ) -> Row:
     """The row of a time at which a method had no image yet: no samples, and no number for an error."""
+    phases: dict[str, Any] = {f"seconds_{phase}": None for phase in PHASES}
     return Row(
         **common,
         time=time,
@@ -341,7 +343,7 @@ def nothing_yet(
         height=size[1],
         spp=0,
         paths=0,
-        **{f"seconds_{phase}": None for phase in PHASES},
+        **phases,
         nonzero_share=None,
         relmse=math.nan,
         relmse_error=math.nan,
