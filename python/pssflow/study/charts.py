@@ -210,6 +210,9 @@ def _scene_axes(axes: Any, title: str, label: str, last: bool) -> None:
     axes.set_ylabel(label)
     if last:
         axes.set_xlabel("wall time used (s)")
+    low, high = axes.get_ylim()
+    if low > 1e-3 and high < 1e3 and high < 100.0 * low:
+        _plain_ticks(axes.yaxis)
     axes.grid(which="both", color="#e3e3e3", linewidth=0.5)
     axes.set_axisbelow(True)
     axes.tick_params(labelsize=8, which="both")

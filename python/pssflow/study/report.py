@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from ..report import markdown_table, number, percent, scene_title
 from .charts import NOISY, error_chart, ratio_chart
 from .flip import has_flip
 from .harness import Study
+from .methods import OTHERS
 from .page import Chart, write_page
 from .store import Row
 from .summary import BASELINE, CLOSE, Cell, Choice, Overall, cells, choices, overall, reaches
@@ -71,7 +73,7 @@ def publish(study: Study, rows: Sequence[Row], title: str) -> list[Any]:
     methods = [m.name for m in study.methods if any(row.method == m.name for row in rows)]
     found = cells(rows)
     total = overall(found)
-    picked = choices(found) if "auto" in methods else []
+    picked = choices(found, competitors=OTHERS) if "auto" in methods else []
     sheets = [
         *([_sums(total)] if total else []),
         _errors(found),
@@ -210,10 +212,9 @@ def _charts(
         if all(getattr(row, measure) is None for row in rows):
             continue
         noise = "" if measure in NOISY else " It holds the reference’s noise."
-        caption = (
-            f"{where}; lines are means over seeds, bands reach from the least to the largest. "
-            f"Points lie at the seconds really used.{noise}"
-        )
+        bands = "lines are means over seeds, bands reach from the least to the largest. "
+        bands = bands if len(study.seeds) > 1 else ""
+        caption = f"{where}; {bands}points lie at the seconds really used.{noise}"
         path = study.folder / f"{name}.png"
         heading = f"{heading}: {title}"
         error_chart(path, heading, rows, methods, measure=measure, label=label, caption=caption)
@@ -226,6 +227,9 @@ def _charts(
         charts.insert(1, Chart(path.with_suffix(".svg"), heading, first=True))
     return charts
 
+
+CROWDED = 1.75
+"""Load average a core, own work inside, above which times say more about other processes than about methods."""
 
 BIAS_ERRORS = 4.0
 BIAS_SHARE = 0.05
@@ -318,10 +322,18 @@ def _failures(study: Study) -> list[str]:
 def _machine(rows: Sequence[Row]) -> list[str]:
     loads = [max(row.load_before, row.load_after) for row in rows]
     commits = ", ".join(sorted({row.commit for row in rows}))
-    return [
-        f"{rows[0].processor}; load average up to {max(loads):.1f}, in the mean {sum(loads) / len(loads):.1f}; "
+    mean, cores = sum(loads) / len(loads), os.cpu_count() or 1
+    lines = [
+        f"{rows[0].processor}; load average up to {max(loads):.1f}, in the mean {mean:.1f}; "
         f"commit {commits}; Mitsuba {rows[0].mitsuba}."
     ]
+    if mean > CROWDED * cores:
+        lines.insert(
+            0,
+            f"CROWDED: with a load of {mean:.1f} on {cores} cores others took much of each run's time; "
+            "methods share a machine in different ways, so that ratios at equal time are not to be trusted",
+        )
+    return lines
 
 
 def _too_early(early: Sequence[Row]) -> list[str]:

@@ -237,8 +237,10 @@ class Choice:
         return self.over.value - SIGNIFICANT * error <= CLOSE
 
 
-def choices(found: Sequence[Cell], name: str = "auto") -> list[Choice]:
-    """`auto` against the others, wherever both were measured."""
+def choices(
+    found: Sequence[Cell], name: str = "auto", competitors: Sequence[str] = ()
+) -> list[Choice]:
+    """`auto` against the others, wherever both were measured; `competitors` are none that it could have chosen."""
     result = []
     for cell in found:
         if cell.method != name:
@@ -247,7 +249,7 @@ def choices(found: Sequence[Cell], name: str = "auto") -> list[Choice]:
             c
             for c in found
             if (c.scene, c.time) == (cell.scene, cell.time)
-            and c.method != name
+            and c.method not in (name, *competitors)
             and c.work.value > 0.0
         ]
         if not others:
