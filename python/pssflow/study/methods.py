@@ -55,6 +55,8 @@ class Stage:
     load: Callable[[str], Any]
     """Sets a variant of Mitsuba and loads the scene in it, with the film's size of `scene`."""
     loaded: dict[str, Any] = field(default_factory=dict)
+    too_slow: set[str] = field(default_factory=set)
+    """Methods that could not finish a pass in their time: other seeds need not try."""
 
     def in_variant(self, variant: str) -> Any:
         """The `mi.Scene`, loaded once. Sets the variant."""
@@ -153,11 +155,10 @@ def shot_of(result: Result, seconds: float) -> Shot:
 
 def _mitsuba(name: str, variant: str, k: int, threads: int | None) -> Method:
     """Mitsuba's path tracer for k-bounce light, in passes until the time is over."""
-    too_slow: set[int] = set()
 
     def run(stage: Stage, seed: int, times: Sequence[float], progress: Progress) -> list[Shot]:
-        if id(stage) in too_slow:
-            return []  # not even one pass fits, as another seed has shown
+        if name in stage.too_slow:
+            return []
         if stage.scene.hide_emitters:
             raise ValueError("`hide_emitters` is set, which pssflow_kbounce does not know")
         before = stage.scene.variant
@@ -174,7 +175,7 @@ def _mitsuba(name: str, variant: str, k: int, threads: int | None) -> Method:
 
             mi.set_variant(before)
         if not shots:
-            too_slow.add(id(stage))
+            stage.too_slow.add(name)
         return shots
 
     budget = "rendering inside; loading and compiling outside"
