@@ -92,7 +92,7 @@ study-guides: build ## what each guide gains, costs and comes to at equal time: 
 	$(BIN)/python -m pssflow study guides -o out/study-guides
 
 .PHONY: study-speed-accuracy
-study-speed-accuracy: build $(VENV)/.studies ## error against wall time, Mitsuba and others beside the guides: two hours, out/study-speed-accuracy; resumes
+study-speed-accuracy: build $(VENV)/.studies ## error against wall time, Mitsuba and others beside the guides: an hour, out/study-speed-accuracy; resumes
 	$(BIN)/python -m pssflow study speed-accuracy -o out/study-speed-accuracy
 
 .PHONY: docs
