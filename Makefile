@@ -91,6 +91,10 @@ coverage: build ## every scene beside Mitsuba, by mean and by speed: docs/covera
 study-guides: build ## what each guide gains, costs and comes to at equal time: an hour, out/study-guides; resumes
 	$(BIN)/python -m pssflow study guides -o out/study-guides
 
+.PHONY: study-speed-accuracy
+study-speed-accuracy: build $(VENV)/.studies ## error against wall time, Mitsuba and others beside the guides: an hour, out/study-speed-accuracy; resumes
+	$(BIN)/python -m pssflow study speed-accuracy -o out/study-speed-accuracy
+
 .PHONY: docs
 docs: build $(VENV)/.docs ## Rust API into target/doc, Python API into out/docs
 	RUSTDOCFLAGS="-D warnings" cargo doc --workspace --no-deps
@@ -119,6 +123,6 @@ $(VENV)/.built: $(VENV)/.ready $(SOURCES) $(if $(EXTENSION),,missing-extension)
 missing-extension:
 
 # The extras of the package that is installed by now: pip adds what they ask for and builds nothing.
-$(VENV)/.lint $(VENV)/.docs: $(VENV)/.%: pyproject.toml | $(VENV)/.built
+$(VENV)/.lint $(VENV)/.docs $(VENV)/.studies: $(VENV)/.%: pyproject.toml | $(VENV)/.built
 	$(BIN)/python -m pip install --quiet 'pssflow[$*]'
 	touch $@

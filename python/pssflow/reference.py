@@ -1,12 +1,16 @@
 """Mitsuba's own truth for light of exactly k bounces, in passes, cached and resumed.
 
-truth = `path` with max_depth k + 1 minus `path` with max_depth k, the same film and filter, no Russian roulette before
-depth k + 2. In LLVM variants both are rendered from the same seed: they share all random numbers up to the last
-bounce, so that the common terms cancel exactly. In `scalar_rgb` the streams part ways, and the truth needs far more
-samples.
+The truth is `path` with max_depth k + 1 minus `path` with max_depth k, the same film and filter, no Russian roulette
+before depth k + 2 (`TruthPass`): that is what tests compare with. In LLVM variants both are rendered from one seed:
+they share all random numbers up to the last bounce, so that the common terms cancel exactly. In `scalar_rgb` the
+streams part ways, and the truth needs far more samples.
 
-It is averaged over passes of other seeds; their spread gives each pixel's variance of the mean. This is a truth to
-measure against, not a competitor: it renders the directly lit scene as well, only to throw it away.
+A reference need not render the directly lit scene twice, only to throw it away: in LLVM variants it is rendered by
+`pssflow_kbounce` (`KBouncePass`), Mitsuba's path tracer cut down to light of k bounces, whose mean is that difference
+(`tests/statistical/test_kbounce.py`), at half the time and the same variance. Hidden emitters it does not know: there,
+and in `scalar_rgb`, where it would be Python's speed that counts, the difference remains.
+
+Either is averaged over passes of other seeds; their spread gives each pixel's variance of the mean.
 """
 
 from __future__ import annotations
@@ -35,13 +39,22 @@ from .progress import Progress, reporting
 from .scene import Scene, SceneLike, load_scene
 from .variants import quiet
 
-__all__ = ["Reference", "cache_path", "default_cache", "read_exr", "reference"]
+__all__ = [
+    "KBouncePass",
+    "Reference",
+    "Running",
+    "TruthPass",
+    "cache_path",
+    "default_cache",
+    "read_exr",
+    "reference",
+]
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-FORMAT = 1
-"""Version of the cached file; others are rendered anew."""
+FORMAT = 2
+"""Version of the cached file, in its name; since 2 the name also says which of the two ways it was rendered."""
 
 PATHS_PER_PASS = 1 << 18
 """Camera paths of a pass, about: a pass must end soon after Ctrl-C, and many are needed for a variance."""
@@ -64,7 +77,7 @@ class Reference:
     passes: int
     """Independent images that it is the mean of; 0 for an image from elsewhere."""
     spp: int
-    """Samples per pixel in all, of each of the two depths."""
+    """Samples per pixel in all; of each of the two depths, where it is a difference."""
     seconds: float
     """That rendering took, earlier calls included."""
     note: str
@@ -158,13 +171,19 @@ def reference(
         hide_emitters=scene.hide_emitters if own else None,
         approximate=own and scene.approximate,
     )
-    path = _writable_cache(cache, notices, exported, k, seed0)
+    hide = bool(exported.description["hide_emitters"])
+    way = KBouncePass if is_jit(mi_scene) and not hide else TruthPass
+    path = _writable_cache(cache, notices, exported, k, seed0, way.name)
     total = _load(path, notices) if path is not None else None
     reused = 0 if total is None else total.passes
     film = exported.description["film"]["crop_size"]
     if total is None:
-        total = _Running.empty(film, max(PATHS_PER_PASS // (film[0] * film[1]), 1))
-    renderer = TruthPass(mi_scene, camera, k, hide=exported.description["hide_emitters"])
+        total = Running.empty(film, max(PATHS_PER_PASS // (film[0] * film[1]), 1))
+    renderer = (
+        KBouncePass(mi_scene, camera, k)
+        if way is KBouncePass
+        else TruthPass(mi_scene, camera, k, hide=hide)
+    )
     saved = time.monotonic()
     with reporting(progress) as listener:
         passes = _more(total, renderer, seed0, limit, target, listener)
@@ -189,7 +208,7 @@ def reference(
         passes=total.passes,
         spp=total.spp,
         seconds=total.seconds,
-        note="; ".join([f"Mitsuba path, {mi_scene.variant_name()}, {ending}{origin}", *notices]),
+        note="; ".join([f"{way.name}, {mi_scene.variant_name()}, {ending}{origin}", *notices]),
         k=k,
         path=path,
         reached=reached,
@@ -227,10 +246,10 @@ def default_cache() -> Path:
     return Path(base).expanduser() / "pssflow" / "references"
 
 
-def cache_path(folder: str | Path, exported: Export, k: int, seed0: int = 0) -> Path:
+def cache_path(folder: str | Path, exported: Export, k: int, seed0: int, way: str) -> Path:
     """Where the truth of an exported scene is kept: the name holds a hash of all that it depends on."""
     digest = hashlib.sha256()
-    digest.update(json.dumps([FORMAT, mi.__version__, k, seed0]).encode())
+    digest.update(json.dumps([FORMAT, mi.__version__, k, seed0, way]).encode())
     digest.update(exported.json().encode())
     for array in exported.arrays:
         digest.update(str((array.dtype.str, array.shape)).encode())
@@ -241,7 +260,7 @@ def cache_path(folder: str | Path, exported: Export, k: int, seed0: int = 0) -> 
 
 
 @dataclass(frozen=True)
-class _Running:
+class Running:
     """Mean and sum of squared deviations over passes (Welford 1962), (H, W, 3) in double precision."""
 
     mean: F64
@@ -253,11 +272,12 @@ class _Running:
     non_finite: int
 
     @classmethod
-    def empty(cls, size: list[int], spp_per_pass: int) -> _Running:
+    def empty(cls, size: list[int], spp_per_pass: int) -> Running:
+        """Before the first pass, of an image of (width, height)."""
         shape = (size[1], size[0], 3)
         return cls(np.zeros(shape), np.zeros(shape), 0, spp_per_pass, 0.0, 0, 0)
 
-    def with_pass(self, image: F64, *, spp: int, non_finite: int, seconds: float) -> _Running:
+    def with_pass(self, image: F64, *, spp: int, non_finite: int, seconds: float) -> Running:
         """The state after one more pass."""
         delta = image - self.mean
         mean = self.mean + delta / (self.passes + 1)
@@ -276,43 +296,39 @@ class _Running:
         return self.m2 / max((self.passes - 1) * self.passes, 1)
 
     def standard_error(self) -> float:
+        """Relative standard error of the mean, as `Reference.standard_error`."""
         return metrics.relative_error(self.variance(), self.mean)
 
 
-class TruthPass:
-    """One pass of the truth, from a seed of its own: the difference of two path integrators.
+def is_jit(scene: Any) -> bool:
+    """Whether an `mi.Scene` belongs to a variant that compiles."""
+    return not scene.variant_name().startswith("scalar")
 
-    Args:
-        scene: an `mi.Scene`.
-        sensor: index of the sensor, or a sensor object.
-        k: bounces.
-        hide: whether emitters are seen through, as Mitsuba's `hide_emitters`.
-    """
 
-    def __init__(self, scene: Any, sensor: Any, k: int, *, hide: bool) -> None:
+class _Pass:
+    """What both ways to render a pass share: the film, read raw, and the sampler, left as it was."""
+
+    name = ""
+    """For notes and the cache's names."""
+
+    def __init__(self, scene: Any, sensor: Any) -> None:
         self.scene = scene
         self.camera = select_sensor(scene, sensor)
-        self.jit = not scene.variant_name().startswith("scalar")
-        self.deep, self.shallow = (
-            mi.load_dict(
-                {"type": "path", "max_depth": depth, "rr_depth": k + 2, "hide_emitters": hide}
-            )
-            for depth in (k + 1, k)
-        )
+        self.jit = is_jit(scene)
         self.sample_count = self.camera.sampler().sample_count()
 
     def __call__(self, seed: int, spp: int) -> tuple[F64, int, int]:
         """The image (H, W, 3), samples that the sampler made of `spp`, and values that were not finite."""
-        # A scalar sampler's streams part ways at the last bounce, so that one seed for both would buy nothing.
-        seeds = (seed, seed) if self.jit else (2 * seed, 2 * seed + 1)
         # Its warnings are of Ctrl-C, which is answered elsewhere, and of values that are counted here.
         with dr.suspend_grad(), quiet():
-            deep = self._image(self.deep, seeds[0], spp)
-            shallow = self._image(self.shallow, seeds[1], spp)
-        image = deep - shallow
+            image = self._render(seed, spp)
         bad = ~np.isfinite(image)
         image[bad] = 0.0
         return image, self.camera.sampler().sample_count(), int(np.count_nonzero(bad))
+
+    def _render(self, seed: int, spp: int) -> F64:
+        """The image, with whatever is in it."""
+        raise NotImplementedError
 
     def restore(self) -> None:
         """Gives the sampler its own count back: rendering with another one changes it."""
@@ -328,14 +344,60 @@ class TruthPass:
         return raw[..., :3] / np.where(weight == 0.0, 1.0, weight)
 
 
+class TruthPass(_Pass):
+    """One pass of the truth, from a seed of its own: the difference of two path integrators.
+
+    Args:
+        scene: an `mi.Scene`.
+        sensor: index of the sensor, or a sensor object.
+        k: bounces.
+        hide: whether emitters are seen through, as Mitsuba's `hide_emitters`.
+    """
+
+    name = "difference of two Mitsuba path"
+
+    def __init__(self, scene: Any, sensor: Any, k: int, *, hide: bool) -> None:
+        super().__init__(scene, sensor)
+        self.deep, self.shallow = (
+            mi.load_dict(
+                {"type": "path", "max_depth": depth, "rr_depth": k + 2, "hide_emitters": hide}
+            )
+            for depth in (k + 1, k)
+        )
+
+    def _render(self, seed: int, spp: int) -> F64:
+        # A scalar sampler's streams part ways at the last bounce, so that one seed for both would buy nothing.
+        seeds = (seed, seed) if self.jit else (2 * seed, 2 * seed + 1)
+        return self._image(self.deep, seeds[0], spp) - self._image(self.shallow, seeds[1], spp)
+
+
+class KBouncePass(_Pass):
+    """One pass of Mitsuba's path tracer for light of exactly k bounces (`plugins/kbounce.py`).
+
+    Args:
+        scene: an `mi.Scene` of the active variant.
+        sensor: index of the sensor, or a sensor object.
+        k: bounces.
+    """
+
+    name = "Mitsuba path, k bounces only"
+
+    def __init__(self, scene: Any, sensor: Any, k: int) -> None:
+        super().__init__(scene, sensor)
+        self.integrator = mi.load_dict({"type": "pssflow_kbounce", "k": k})
+
+    def _render(self, seed: int, spp: int) -> F64:
+        return self._image(self.integrator, seed, spp)
+
+
 def _more(
-    total: _Running,
+    total: Running,
     renderer: Callable[[int, int], tuple[F64, int, int]],
     seed0: int,
     limit: float,
     target: float,
     listener: Callable[[str, float], None] | None,
-) -> Iterator[_Running]:
+) -> Iterator[Running]:
     """The states after each further pass, until the error or the time is reached; none if they are already."""
     check = LEAST_PASSES
     while True:
@@ -353,7 +415,7 @@ def _more(
         yield total
 
 
-def _next_check(total: _Running, limit: float) -> int:
+def _next_check(total: Running, limit: float) -> int:
     """The pass after which to look again: 5 % more passes, but not past the end of the time."""
     each = max(total.seconds / total.passes, 1e-9)
     in_time = (
@@ -362,7 +424,7 @@ def _next_check(total: _Running, limit: float) -> int:
     return max(total.passes + 1, int(min(math.ceil(total.passes * 1.05), in_time)))
 
 
-def _ending(total: _Running, limit: float, target_se: float | None, reached: bool) -> str:
+def _ending(total: Running, limit: float, target_se: float | None, reached: bool) -> str:
     error = f"relative standard error {total.standard_error():.2g}"
     if target_se is None:
         return f"{total.seconds:.1f} s, {error}"
@@ -372,14 +434,19 @@ def _ending(total: _Running, limit: float, target_se: float | None, reached: boo
 
 
 def _writable_cache(
-    cache: str | Path | bool | None, notices: list[str], exported: Export, k: int, seed0: int
+    cache: str | Path | bool | None,
+    notices: list[str],
+    exported: Export,
+    k: int,
+    seed0: int,
+    way: str,
 ) -> Path | None:
     """The file to use, its folder made; None without a cache. A default that cannot be written is no error."""
     if cache is False:
         return None
     default = not isinstance(cache, (str, Path))
     folder = default_cache() if default else Path(cache)
-    path = cache_path(folder, exported, k, seed0)
+    path = cache_path(folder, exported, k, seed0, way)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         write_beside(path.with_suffix(".probe"), lambda part: part.touch())
@@ -392,7 +459,7 @@ def _writable_cache(
     return path
 
 
-def _load(path: Path, notices: list[str]) -> _Running | None:
+def _load(path: Path, notices: list[str]) -> Running | None:
     """The cached state; None, with a notice where there is a file, if it cannot be used."""
     if not path.exists():
         return None
@@ -401,7 +468,7 @@ def _load(path: Path, notices: list[str]) -> _Running | None:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             if int(stored["format"]) != FORMAT:
                 return None
-            return _Running(
+            return Running(
                 mean=stored["mean"],
                 m2=stored["m2"],
                 passes=int(stored["passes"]),
@@ -415,7 +482,7 @@ def _load(path: Path, notices: list[str]) -> _Running | None:
         return None
 
 
-def _save(path: Path | None, total: _Running) -> None:
+def _save(path: Path | None, total: Running) -> None:
     if path is None:
         return
 

@@ -146,9 +146,11 @@ def panel(run: Result, truth: Reference, *, gain: str = "", title: str = "") -> 
 def reference_panel(truth: Reference) -> Panel:
     """The truth, and how well it is known."""
     name = "Mitsuba’s path" if truth.k is not None else "reference"
-    lines = [f"depth {truth.k + 1} − depth {truth.k}"] if truth.k is not None else []
+    lines = []
+    if truth.k is not None:
+        lines.append("light of 1 bounce" if truth.k == 1 else f"light of {truth.k} bounces")
     if truth.spp:
-        lines.append(f"{count(truth.spp)} spp each, {truth.seconds:.0f} s")
+        lines.append(f"{count(truth.spp)} spp, {truth.seconds:.0f} s")
     if truth.variance.any():
         lines.append(f"relative standard error {number(truth.standard_error, 2)}")
     return Panel(name, np.maximum(truth.image, 0.0), lines)

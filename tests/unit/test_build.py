@@ -54,6 +54,7 @@ def test_make_help_lists_every_target() -> None:
             "bench",
             "coverage",
             "study-guides",
+            "study-speed-accuracy",
             "docs",
             "clean",
         )

@@ -14,12 +14,13 @@ from typing import Any
 import mitsuba as mi
 
 from ..variants import VARIANTS
-from . import integrator
+from . import integrator, kbounce
 
 __all__ = ["PLUGINS", "register"]
 
 PLUGINS: dict[str, tuple[str, Callable[[], Callable[[Any], Any]]]] = {
     "pssflow": ("register_integrator", integrator.define),
+    "pssflow_kbounce": ("register_integrator", kbounce.define),
 }
 """Name in a scene → the registering function's name in `mitsuba`, and what makes a constructor for one variant."""
 

@@ -20,9 +20,15 @@ from .summary import BASELINE, Cell, Overall
 __all__ = ["error_chart", "ratio_chart", "style"]
 
 COLOURS = ("#000000", "#e69f00", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#7f7f7f")
-MARKERS = "osD^vPX*"
+MARKERS = "osD^vPX*<>h"  # not as many as colours: what has the same colour has another marker
 LINES = ("-", "--", "-.", (0, (1, 1)), (0, (5, 1)), (0, (3, 1, 1, 1, 1, 1)))
 MUTED = "#666666"
+
+NOISY = ("relmse", "relmse_trimmed")
+"""Measures from which the reference's variance is subtracted."""
+
+SLOPES = {"relmse": -1.0, "relmse_trimmed": -1.0, "mape": -0.5}
+"""How measures fall with time; of others that is not known. MAPE is a mean of roots."""
 
 
 def style(methods: Sequence[str], method: str) -> dict[str, Any]:
@@ -47,7 +53,8 @@ def error_chart(
 ) -> list[Path]:
     """Error against seconds used, log-log, a panel a scene: means over seeds, and a band from the least to the largest.
 
-    The dotted line has slope −1, how relMSE falls; below the dashed one errors drown in the truth's own noise.
+    Dotted: the slope with which the measure falls, −1 for relMSE. Below the dashed line, shaded, errors drown in the
+    truth's own noise.
 
     Raises:
         OSError: a file cannot be written.
@@ -59,6 +66,8 @@ def error_chart(
     for i, scene in enumerate(scenes):
         axes = figure.add_subplot(lines, columns, i + 1)
         own = [row for row in rows if row.scene == scene]
+        axes.set_xscale("log")
+        axes.set_yscale("log")
         for method in methods:
             _curve(
                 axes, [row for row in own if row.method == method], measure, style(methods, method)
@@ -70,8 +79,10 @@ def error_chart(
     handles = _legend_handles(methods)
     from matplotlib.lines import Line2D
 
-    handles.append(Line2D([], [], color=MUTED, linestyle=":", label="slope −1"))
-    if measure == "relmse":
+    if measure in SLOPES:
+        slope = f"slope −{-SLOPES[measure]:g}"
+        handles.append(Line2D([], [], color=MUTED, linestyle=":", label=slope))
+    if measure in NOISY:
         handles.append(
             Line2D([], [], color=MUTED, linestyle="--", label="the reference’s own variance")
         )
@@ -151,6 +162,8 @@ def _curve(axes: Any, rows: Sequence[Row], measure: str, look: dict[str, Any]) -
     x, y, low, high = [], [], [], []
     for time in times:
         values = [getattr(row, measure) for row in rows if row.time == time]
+        if None in values:
+            continue
         mean = sum(values) / len(values)
         if mean <= 0.0:
             continue  # drowned: a logarithm has no place for it
@@ -166,33 +179,40 @@ def _curve(axes: Any, rows: Sequence[Row], measure: str, look: dict[str, Any]) -
 
 def _guides(axes: Any, rows: Sequence[Row], measure: str) -> None:
     """The slope, through the middle of what is drawn, and the truth's noise."""
-    positive = [(row.elapsed, getattr(row, measure)) for row in rows if getattr(row, measure) > 0.0]
-    if not positive or measure == "mape":
+    values = [(row.elapsed, getattr(row, measure)) for row in rows]
+    positive = [(x, y) for x, y in values if y is not None and y > 0.0]
+    if not positive:
         return
     left, right = min(x for x, _ in positive), max(x for x, _ in positive)
-    middle = math.exp(sum(math.log(x * y) for x, y in positive) / len(positive))
-    if right > left:
+    if measure in SLOPES and right > left:
+        slope = SLOPES[measure]
+        middle = math.exp(sum(math.log(y * x**-slope) for x, y in positive) / len(positive))
         axes.plot(
             [left, right],
-            [middle / left, middle / right],
+            [middle * left**slope, middle * right**slope],
             color=MUTED,
             linestyle=":",
             linewidth=1.2,
             zorder=1,
         )
     noise = rows[-1].reference_variance
-    if measure == "relmse" and noise > 0.0:
+    if measure in NOISY and noise > 0.0:
+        low, high = axes.get_ylim()
         axes.axhline(noise, color=MUTED, linestyle="--", linewidth=1, zorder=1)
+        if noise > low:
+            axes.axhspan(low, noise, color=MUTED, alpha=0.12, linewidth=0, zorder=0)
+            axes.set_ylim(low, high)
 
 
 def _scene_axes(axes: Any, title: str, label: str, last: bool) -> None:
-    axes.set_xscale("log")
-    axes.set_yscale("log")
     _plain_ticks(axes.xaxis)
     axes.set_title(title, fontsize=10)
     axes.set_ylabel(label)
     if last:
         axes.set_xlabel("wall time used (s)")
+    low, high = axes.get_ylim()
+    if low > 1e-3 and high < 1e3 and high < 100.0 * low:
+        _plain_ticks(axes.yaxis)
     axes.grid(which="both", color="#e3e3e3", linewidth=0.5)
     axes.set_axisbelow(True)
     axes.tick_params(labelsize=8, which="both")

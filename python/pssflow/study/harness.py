@@ -2,7 +2,8 @@
 
 Within a scene the methods take turns, seed by seed and each time in another order, so that whatever else the machine
 does hits all of them alike. One run goes to the longest time and hands out its image at the shorter ones. A finished
-run is kept at once; what was kept under the same configuration is not run again.
+run is kept at once; what was kept under the same configuration is not run again, and what was kept under another one is
+not shown.
 """
 
 from __future__ import annotations
@@ -26,11 +27,17 @@ from ..files import first_line
 from ..output import make_folder
 from ..progress import Progress
 from ..reference import Reference, read_exr
+from .flip import flip
 from .store import Row, Store, commit, configuration, processor
 
 __all__ = ["Case", "Method", "Scenery", "Shot", "Study", "image_path", "reference_path"]
 
 F32 = NDArray[np.float32]
+
+PHASES = ("pilot", "fit", "render", "warm_up")
+
+FAILURES = (OSError, ValueError, RuntimeError)
+"""What one scene or method may raise without ending the study; a mistake in pssflow ends it."""
 
 
 @dataclass(frozen=True)
@@ -49,11 +56,12 @@ class Shot:
     chosen: str = ""
     nonzero_share: float | None = None
     seconds: Mapping[str, float] = field(default_factory=dict)
-    """By phase: `pilot`, `fit`, `render`."""
+    """By phase: `pilot`, `fit`, `render`; `warm_up` is outside of the time."""
 
 
 Runner = Callable[[Any, int, Sequence[float], Progress], Sequence[Shot]]
-"""Renders a case's scene with a seed; returns a shot for each of the increasing times. Training is inside them."""
+"""Renders a case's scene with a seed; returns a shot for each of the increasing times at which there was an image.
+Training is inside them."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +72,8 @@ class Method:
     run: Runner
     options: Mapping[str, Any] = field(default_factory=dict)
     """What sets it apart, for the record and the configuration's hash."""
+    budget: str = "pilot, training and selection inside"
+    """What its time counts."""
 
 
 @dataclass(frozen=True)
@@ -97,10 +107,11 @@ class Study:
         methods: the methods.
         times: seconds, increasing; a run goes to the last.
         seeds: numbers of the seeds.
-        settings: what all runs share, for the rows and the configuration's hash: `k`, `emitter_strategy`, `threads`.
+        settings: what all runs share, for the rows and the configuration's hash: `k`, `emitter_strategy`, `threads`,
+            and whatever else decides a row, as `reference_time`.
         say: told what is being done.
         progress: as in `pssflow.render`.
-        publish: called with the rows so far after each scene.
+        publish: called with the rows so far after each scene but the last, and on Ctrl-C.
     """
 
     folder: Path
@@ -117,21 +128,25 @@ class Study:
         make_folder(self.folder / "images")
         self.store = Store(self.folder / "results.csv")
         self.failures: dict[str, str] = {}
-        """Scenes that could not be loaded, and why."""
+        """Scenes, and methods on scenes, that could not be shown, and why."""
+        self._digests: dict[str, str] = {}
+        """Of the scenes that were opened."""
 
     @property
     def rows(self) -> list[Row]:
-        """Rows of this study's scenes, methods, seeds and times; others in the file are left alone."""
+        """Rows of this very study; others in the file (other settings, an edited scene) are left alone."""
         scenes = {scenery.name for scenery in self.sceneries}
-        methods = {method.name for method in self.methods}
+        methods = {method.name: method for method in self.methods}
         return [
             row
             for row in self.store.rows
             if row.scene in scenes
+            and row.scene not in self.failures
             and row.method in methods
             and row.seed in self.seeds
-            and row.time in self.times
-            and row.longest == self.times[-1]
+            and row.scene_hash == self._digests.get(row.scene, row.scene_hash)
+            and row.configuration
+            == self._key(row.scene, row.scene_hash, methods[row.method], row.seed)
         ]
 
     def run(self) -> list[Row]:
@@ -145,17 +160,32 @@ class Study:
             for scenery in self.sceneries:
                 try:
                     case = scenery.open()
-                except (OSError, ValueError, RuntimeError) as error:
-                    self.failures[scenery.name] = first_line(error)
-                    self.say(f"{scenery.name} is left out: {first_line(error)}")
+                except FAILURES as error:
+                    self._leave_out(scenery.name, error)
                     clock.skip(len(self.methods) * len(self.seeds))
                     continue
-                if self._scene(scenery.name, case, clock):
+                self._digests[scenery.name] = case.digest
+                ran = self._scene(scenery.name, case, clock)
+                if ran and scenery is not self.sceneries[-1]:
                     self.publish(self.rows)
         except KeyboardInterrupt:
             self.publish(self.rows)
             raise
         return self.rows
+
+    def _leave_out(self, what: str, error: Exception) -> None:
+        self.failures[what] = first_line(error)
+        self.say(f"{what} is left out: {first_line(error)}")
+
+    def _key(self, scene: str, digest: str, method: Method, seed: int) -> str:
+        return configuration(
+            scene=[scene, digest],
+            method=method.name,
+            options=method.options,
+            times=list(self.times),
+            seed=seed,
+            settings=dict(self.settings),
+        )
 
     def _scene(self, name: str, case: Case, clock: _Clock) -> bool:
         """The runs of one scene; whether there were any."""
@@ -163,49 +193,56 @@ class Study:
         for turn, seed in enumerate(self.seeds):
             shift = turn % len(self.methods)
             for method in [*self.methods[shift:], *self.methods[:shift]]:
-                key = configuration(
-                    scene=[name, case.digest],
-                    method=method.name,
-                    options=method.options,
-                    times=list(self.times),
-                    seed=seed,
-                    settings=dict(self.settings),
-                )
-                wanted.append((method, seed, key))
+                wanted.append((method, seed, self._key(name, case.digest, method, seed)))
         missing = [run for run in wanted if not self.store.has(run[2])]
         clock.skip(len(wanted) - len(missing))
         if not missing:
             return False
         self.say(f"{name}: Mitsuba's reference, unless it is cached")
-        truth = case.truth()
-        truth.write(reference_path(self.folder, name))
-        case.warm_up()
+        try:
+            truth = case.truth()
+            truth.write(reference_path(self.folder, name))
+            case.warm_up()
+        except FAILURES as error:
+            self._leave_out(name, error)
+            clock.skip(len(missing))
+            return False
         for method, seed, key in missing:
+            failure = f"{method.name} on {name}"
+            if failure in self.failures:
+                clock.skip(1)
+                continue
             self.say(f"{clock.place()} {name}, {method.name}, seed {seed}; {clock.left()}")
-            with clock.run():
-                before = os.getloadavg()[0]
-                shots = method.run(case.scene, seed, self.times, self.progress)
-                after = os.getloadavg()[0]
-                common = self._common(name, method, seed, key, before, after)
-                self._keep_images(name, method, seed, shots)
-                self.store.put([measured(shot, truth, common) for shot in shots])
+            before = os.getloadavg()[0]
+            try:
+                with clock.run():
+                    shots = method.run(case.scene, seed, self.times, self.progress)
+            except FAILURES as error:
+                self._leave_out(failure, error)
+                continue
+            common = self._common(name, case, method, seed, key)
+            common |= {"load_before": before, "load_after": os.getloadavg()[0]}
+            self._keep_images(name, method, seed, shots)
+            found = {shot.time: measured(shot, truth, common) for shot in shots}
+            size = truth.image.shape[1], truth.image.shape[0]
+            self.store.put(
+                found.get(time) or nothing_yet(time, size, truth, common) for time in self.times
+            )
         return True
 
-    def _common(
-        self, name: str, method: Method, seed: int, key: str, before: float, after: float
-    ) -> dict[str, Any]:
+    def _common(self, name: str, case: Case, method: Method, seed: int, key: str) -> dict[str, Any]:
         import mitsuba as mi
 
         return {
             "scene": name,
+            "scene_hash": case.digest,
             "method": method.name,
+            "budget": method.budget,
             "seed": seed,
             "longest": self.times[-1],
             "k": self.settings["k"],
             "emitter_strategy": self.settings["emitter_strategy"],
             "threads": self.settings["threads"],
-            "load_before": before,
-            "load_after": after,
             "options": json.dumps(dict(method.options), sort_keys=True),
             "configuration": key,
             "commit": commit(),
@@ -226,12 +263,20 @@ class Study:
             path = image_path(self.folder, name, method.name, seed, shot.time)
             _core.write_exr(str(path), layers)
 
+    def image_path(self, row: Row) -> Path:
+        """Where a row's image lies; of seeds after the first only the last one is kept."""
+        return image_path(self.folder, row.scene, row.method, row.seed, row.time)
+
+    def reference_path(self, scene: str) -> Path:
+        """Where a scene's truth lies."""
+        return reference_path(self.folder, scene)
+
     def floors(self) -> dict[tuple[str, str], metrics.Estimate]:
         """The squared bias that the last images of several seeds have in common, by scene and method."""
         found: dict[tuple[str, str], metrics.Estimate] = {}
         if len(self.seeds) < 2:
             return found
-        done = {row.run for row in self.rows}
+        done = {row.run for row in self.rows if row.time == self.times[-1] and row.spp}
         for scenery in self.sceneries:
             truth = None
             for method in self.methods:
@@ -260,6 +305,8 @@ def measured(shot: Shot, truth: Reference, common: Mapping[str, Any]) -> Row:
     own = None
     if shot.variance is not None and np.isfinite(shot.variance).all():
         own = metrics.finite_or_none(metrics.relative_variance(shot.variance, truth.image))
+    phases: dict[str, Any] = {f"seconds_{phase}": shot.seconds.get(phase) for phase in PHASES}
+    error = metrics.relmse_with_error(shot.image, truth.image, truth.variance)
     return Row(
         **common,
         time=shot.time,
@@ -269,14 +316,41 @@ def measured(shot: Shot, truth: Reference, common: Mapping[str, Any]) -> Row:
         height=height,
         spp=shot.spp,
         paths=shot.spp * width * height,
-        seconds_pilot=shot.seconds.get("pilot"),
-        seconds_fit=shot.seconds.get("fit"),
-        seconds_render=shot.seconds.get("render"),
+        **phases,
         nonzero_share=shot.nonzero_share,
-        relmse=metrics.relmse(shot.image, truth.image, truth.variance),
+        relmse=error.value,
+        relmse_error=error.error,
         relmse_trimmed=metrics.relmse_trimmed(shot.image, truth.image, truth.variance),
         mape=metrics.mape(shot.image, truth.image),
+        flip=flip(shot.image, truth.image),
         own_variance=own,
+        reference_variance=metrics.relative_variance(truth.variance, truth.image),
+        reference_seconds=truth.seconds,
+    )
+
+
+def nothing_yet(
+    time: float, size: tuple[int, int], truth: Reference, common: Mapping[str, Any]
+) -> Row:
+    """The row of a time at which a method had no image yet: no samples, and no number for an error."""
+    phases: dict[str, Any] = {f"seconds_{phase}": None for phase in PHASES}
+    return Row(
+        **common,
+        time=time,
+        elapsed=time,
+        chosen="",
+        width=size[0],
+        height=size[1],
+        spp=0,
+        paths=0,
+        **phases,
+        nonzero_share=None,
+        relmse=math.nan,
+        relmse_error=math.nan,
+        relmse_trimmed=math.nan,
+        mape=math.nan,
+        flip=None,
+        own_variance=None,
         reference_variance=metrics.relative_variance(truth.variance, truth.image),
         reference_seconds=truth.seconds,
     )

@@ -13,6 +13,10 @@ STUDIES = {
         "guides",
         "What each guide gains, costs and comes to at equal time; what `auto` chose.",
     ),
+    "speed-accuracy": (
+        "speed_accuracy",
+        "Error against wall time: guides, Mitsuba and others, with charts and an image viewer.",
+    ),
 }
 """Name → the module in this package that defines a command of that name, and what it shows."""
 

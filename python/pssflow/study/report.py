@@ -1,48 +1,118 @@
-"""What a study prints and writes from its rows: tables as text and Markdown, and charts."""
+"""What a study prints and writes from its rows: tables as text, Markdown and HTML, and charts."""
 
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from rich.table import Table
 
 from ..files import write_beside
 from ..metrics import Estimate
-from ..report import markdown_table, number, scene_title
-from .charts import error_chart, ratio_chart
+from ..report import markdown_table, number, percent, scene_title
+from .charts import NOISY, error_chart, ratio_chart
+from .flip import has_flip
 from .harness import Study
+from .methods import OTHERS
+from .page import Chart, write_page
 from .store import Row
-from .summary import BASELINE, CLOSE, Choice, cells, choices, overall
+from .summary import BASELINE, CLOSE, Cell, Choice, Overall, cells, choices, overall, reaches
 
 __all__ = ["biased", "publish"]
 
-HEADINGS = (
-    *("scene", "guide", "time", "spp", "relMSE", "trimmed", "MAPE", "own variance"),
-    *("gain / path", "cost / path", "equal samples", "equal time", "verdict"),
-)
-
 NOTES = """\
-Ratios are those of random sampling ÷ the guide: above 1 is a gain; but cost is the guide's ÷ random's. gain / path: the
-images' own variance; equal samples and equal time: relMSE; cost: seconds a path with pilot and training inside.
-± is one standard error over seeds; win and loss are beyond two. Of relMSE the reference's own relative variance is
-subtracted; * lies below it. “trimmed” leaves out the worst 0.1 % of pixels, which hides fireflies. MAPE holds the
-reference's noise. A time shorter than the run is a snapshot of it: its pilot was planned for the whole."""
+relMSE, and the variance that an image says of itself, are relative to the reference (docs of pssflow.metrics); of
+relMSE the reference's own variance is subtracted, * lies below it. “trimmed” leaves out the worst 0.1 % of pixels,
+which hides fireflies. MAPE and FLIP (HDR-FLIP's mean, 0 … 1) hold the reference's noise. variance × time: the image's
+own, in seconds. Time to an error: where the line of means over seeds crosses it on logarithmic axes, never beyond what
+was measured. Ratios are those of random sampling (none) ÷ the method: above 1 is a gain; but cost is the method's ÷
+random's. gain / path: the images' own variance; equal samples and equal time: relMSE; cost: seconds a path with pilot
+and training inside. ± is one standard error over seeds; win and loss are beyond two. A time shorter than the run is a
+snapshot of it: its pilot was planned for the whole."""
+
+MEASURES = {
+    "relmse": ("error", "Error against time", "relMSE"),
+    "relmse_trimmed": (
+        "error-trimmed",
+        "Error without the worst 0.1 % of pixels",
+        "relMSE, trimmed",
+    ),
+    "mape": ("mape", "Mean absolute percentage error against time", "MAPE"),
+    "flip": ("flip", "Visible difference against time", "HDR-FLIP, mean"),
+}
+"""Column of the rows → file, title and axis of its chart."""
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A table in words."""
+
+    title: str
+    headings: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    texts: int = 2
+    """Columns that hold words."""
+    summary: bool = False
+    """Whether a page begins with it."""
 
 
 def publish(study: Study, rows: Sequence[Row], title: str) -> list[Any]:
-    """Writes summary.md, error.png and .svg, and ratio.png and .svg; returns what the command prints.
+    """Writes summary.md, charts as PNG and SVG, and report.html; returns what the command prints.
 
     Raises:
         OSError: a file cannot be written.
     """
     if not rows:
         return []
+    early = [row for row in rows if not row.spp]
+    rows = [row for row in rows if row.spp]
     methods = [m.name for m in study.methods if any(row.method == m.name for row in rows)]
-    found, picked = cells(rows), []
+    found = cells(rows)
     total = overall(found)
+    picked = choices(found, competitors=OTHERS) if "auto" in methods else []
+    sheets = [
+        *([_sums(total)] if total else []),
+        _errors(found),
+        *([_ratios(found)] if total else []),
+        _times_to_errors(found),
+    ]
+    lines = [
+        *biased(study, rows),
+        *_choice_lines(picked),
+        *_too_early(early),
+        *_noisy_references(rows),
+        *_failures(study),
+        *_budgets(rows),
+        *([] if has_flip() else ["FLIP is not measured: the package flip-evaluator is missing"]),
+        *_machine(rows or early),
+    ]
+    heading = title[0].upper() + title[1:]
+    parts = [f"# {heading}"]
+    for sheet in sheets:
+        parts += [
+            f"## {sheet.title}",
+            markdown_table(sheet.headings, sheet.rows, texts=sheet.texts),
+        ]
+    text = "\n\n".join([*parts, NOTES, *lines])
+    write_beside(
+        study.folder / "summary.md", lambda part: part.write_text(text + "\n", encoding="utf-8")
+    )
+    charts = _charts(study, rows, methods, found, total, title) if rows else []
+    write_page(study, rows, heading, sheets, charts, lines, NOTES)
+    shown: list[Any] = [_rich(sheet) for sheet in [*sheets[1:], *sheets[:1]]]
+    written = f"wrote {study.folder}: report.html, results.csv, summary.md, charts, images"
+    return [*shown, NOTES, *lines, written]
+
+
+def _errors(found: Sequence[Cell]) -> Sheet:
+    headings = (
+        *("scene", "method", "time", "spp", "relMSE", "trimmed", "MAPE", "FLIP", "non-zero"),
+        *("own variance", "variance × time"),
+    )
     table = [
         [
             scene_title(cell.scene),
@@ -52,7 +122,26 @@ def publish(study: Study, rows: Sequence[Row], title: str) -> list[Any]:
             with_error(cell.relmse) + ("*" if cell.drowned else ""),
             with_error(cell.relmse_trimmed),
             number(cell.mape.value, 3),
+            number(None if cell.flip is None else cell.flip.value, 3),
+            percent(cell.nonzero_share),
             with_error(cell.own_variance),
+            with_error(cell.variance_time),
+        ]
+        for cell in found
+    ]
+    return Sheet("Errors", headings, table)
+
+
+def _ratios(found: Sequence[Cell]) -> Sheet:
+    headings = (
+        *("scene", "method", "time", "gain / path", "cost / path", "equal samples"),
+        *("equal time", "verdict"),
+    )
+    table = [
+        [
+            scene_title(cell.scene),
+            cell.method,
+            f"{cell.time:g} s",
             with_error(cell.gain),
             with_error(cell.cost),
             with_error(cell.equal_samples),
@@ -60,8 +149,39 @@ def publish(study: Study, rows: Sequence[Row], title: str) -> list[Any]:
             cell.verdict,
         ]
         for cell in found
+        if cell.method != BASELINE
     ]
-    sums = [
+    return Sheet("Ratios to random sampling", headings, table)
+
+
+def _times_to_errors(found: Sequence[Cell]) -> Sheet:
+    """A row for each scene and error, a column for each method."""
+    known = reaches(found)
+    methods = list(dict.fromkeys(reach.method for reach in known))
+    places = list(dict.fromkeys((reach.scene, reach.target) for reach in known))
+    table = [
+        [
+            scene_title(scene),
+            number(target, 2),
+            *(
+                next(
+                    (str(r) for r in known if (r.scene, r.target, r.method) == (scene, target, m)),
+                    "–",
+                )
+                for m in methods
+            ),
+        ]
+        for scene, target in places
+    ]
+    return Sheet("Time to an error", ("scene", "relMSE", *methods), table, texts=1)
+
+
+def _sums(total: Sequence[Overall]) -> Sheet:
+    headings = (
+        *("method", "time", "scenes", "equal time, geometric mean", "gain / path"),
+        *("wins / ties / losses", "worst"),
+    )
+    table = [
         [
             o.method,
             f"{o.time:g} s",
@@ -73,59 +193,49 @@ def publish(study: Study, rows: Sequence[Row], title: str) -> list[Any]:
         ]
         for o in total
     ]
-    sum_headings = (
-        *("guide", "time", "scenes", "equal time, geometric mean", "gain / path"),
-        *("wins / ties / losses", "worst"),
-    )
-    if "auto" in methods:
-        picked = choices(found)
-    lines = [
-        *_choice_lines(picked),
-        *biased(study, rows),
-        *_noisy_references(rows),
-        *_failures(study),
-        *_machine(rows),
-    ]
-    text = "\n\n".join(
-        [
-            f"# {title[0].upper()}{title[1:]}",
-            markdown_table(HEADINGS, table, texts=2),
-            NOTES,
-            *([markdown_table(sum_headings, sums, texts=2)] if sums else []),
-            *lines,
-        ]
-    )
-    write_beside(
-        study.folder / "summary.md", lambda part: part.write_text(text + "\n", encoding="utf-8")
-    )
-    seeds = max((cell.seeds for cell in found), default=1)
-    caption = (
-        f"{rows[0].width}×{rows[0].height} pixels and the like, {seeds} seeds, {rows[0].processor}; "
-        "lines are means over seeds, bands reach from the least to the largest. Points lie at the seconds really used."
-    )
-    error_chart(
-        study.folder / "error.png", f"Error against time: {title}", rows, methods, caption=caption
-    )
-    if any(method != BASELINE for method in methods) and any(c.equal_time for c in found):
-        ratio_chart(
-            study.folder / "ratio.png",
-            f"Gain over random sampling: {title}",
-            found,
-            total,
-            methods,
-            caption=f"Bars: two standard errors over {seeds} seeds. {rows[0].processor}.",
-        )
-    shown: list[Any] = [_rich(HEADINGS, table), NOTES]
-    if sums:
-        shown.append(_rich(sum_headings, sums))
-    return [*shown, *lines, f"wrote {study.folder}: results.csv, summary.md, charts, images"]
+    return Sheet("Summary: random sampling ÷ the method", headings, table, summary=True)
 
+
+def _charts(
+    study: Study,
+    rows: Sequence[Row],
+    methods: Sequence[str],
+    found: Sequence[Cell],
+    total: Sequence[Overall],
+    title: str,
+) -> list[Chart]:
+    """Writes all charts; those for the page."""
+    seeds = "1 seed" if len(study.seeds) == 1 else f"{len(study.seeds)} seeds"
+    where = f"{rows[0].width}×{rows[0].height} pixels and the like, {seeds}, {rows[0].processor}"
+    charts = []
+    for measure, (name, heading, label) in MEASURES.items():
+        if all(getattr(row, measure) is None for row in rows):
+            continue
+        noise = "" if measure in NOISY else " It holds the reference’s noise."
+        bands = "lines are means over seeds, bands reach from the least to the largest. "
+        bands = bands if len(study.seeds) > 1 else ""
+        caption = f"{where}; {bands}points lie at the seconds really used.{noise}"
+        path = study.folder / f"{name}.png"
+        heading = f"{heading}: {title}"
+        error_chart(path, heading, rows, methods, measure=measure, label=label, caption=caption)
+        charts.append(Chart(path.with_suffix(".svg"), heading, first=measure == "relmse"))
+    if any(method != BASELINE for method in methods) and any(c.equal_time for c in found):
+        path = study.folder / "ratio.png"
+        heading = f"Gain over random sampling: {title}"
+        bars = f"Bars: two standard errors over {seeds}. {rows[0].processor}."
+        ratio_chart(path, heading, found, total, methods, caption=bars)
+        charts.insert(1, Chart(path.with_suffix(".svg"), heading, first=True))
+    return charts
+
+
+CROWDED = 1.75
+"""Load average a core, own work inside, above which times say more about other processes than about methods."""
 
 BIAS_ERRORS = 4.0
 BIAS_SHARE = 0.05
 
 
-NOISY = 0.1
+NOISY_REFERENCE = 0.1
 """Relative standard error of a reference above which relMSE itself is off: it divides by the reference's square."""
 
 
@@ -147,7 +257,7 @@ def biased(study: Study, rows: Sequence[Row]) -> list[str]:
         base = floors.get((scene, BASELINE), Estimate(0.0, 0.0))
         if method == BASELINE:
             base = Estimate(0.0, 0.0)
-            if _reference_error(rows, scene) > NOISY:
+            if _reference_error(rows, scene) > NOISY_REFERENCE:
                 continue
         excess = Estimate(floor.value - base.value, math.hypot(floor.error, base.error))
         if excess.value > max(BIAS_ERRORS * excess.error, BIAS_SHARE * error):
@@ -166,7 +276,7 @@ def _noisy_references(rows: Sequence[Row]) -> list[str]:
     lines = []
     for scene in dict.fromkeys(row.scene for row in rows):
         error = _reference_error(rows, scene)
-        if error > NOISY:
+        if error > NOISY_REFERENCE:
             lines.append(
                 f"the reference of {scene_title(scene)} is noisy (relative standard error {number(error, 2)}): "
                 "its relMSE is too large for all methods, and its ratios too near 1; raise --reference-time"
@@ -212,16 +322,45 @@ def _failures(study: Study) -> list[str]:
 def _machine(rows: Sequence[Row]) -> list[str]:
     loads = [max(row.load_before, row.load_after) for row in rows]
     commits = ", ".join(sorted({row.commit for row in rows}))
-    return [
-        f"{rows[0].processor}; load average up to {max(loads):.1f}, in the mean {sum(loads) / len(loads):.1f}; "
+    mean, cores = sum(loads) / len(loads), os.cpu_count() or 1
+    lines = [
+        f"{rows[0].processor}; load average up to {max(loads):.1f}, in the mean {mean:.1f}; "
         f"commit {commits}; Mitsuba {rows[0].mitsuba}."
+    ]
+    if mean > CROWDED * cores:
+        lines.insert(
+            0,
+            f"CROWDED: with a load of {mean:.1f} on {cores} cores others took much of each run's time; "
+            "methods share a machine in different ways, so that ratios at equal time are not to be trusted",
+        )
+    return lines
+
+
+def _too_early(early: Sequence[Row]) -> list[str]:
+    """Times at which a method had no image yet."""
+    times: dict[tuple[str, str], set[float]] = {}
+    for row in early:
+        times.setdefault((row.scene, row.method), set()).add(row.time)
+    return [
+        f"no image yet: {method} on {scene_title(scene)} at {', '.join(f'{t:g}' for t in sorted(at))} s"
+        for (scene, method), at in times.items()
     ]
 
 
-def _rich(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
-    table = Table()
-    for i, heading in enumerate(headings):
-        table.add_column(heading, justify="left" if i < 2 else "right")
+def _budgets(rows: Sequence[Row]) -> list[str]:
+    """What each method's time counts."""
+    methods: dict[str, list[str]] = {}
     for row in rows:
+        named = methods.setdefault(row.budget, [])
+        if row.method not in named:
+            named.append(row.method)
+    return [f"time of {', '.join(names)}: {budget}" for budget, names in methods.items()]
+
+
+def _rich(sheet: Sheet) -> Table:
+    table = Table(title=sheet.title, title_justify="left")
+    for i, heading in enumerate(sheet.headings):
+        table.add_column(heading, justify="left" if i < sheet.texts else "right")
+    for row in sheet.rows:
         table.add_row(*row)
     return table

@@ -1,4 +1,4 @@
-"""Scenes and methods of the studies: by name or file, at about a given number of pixels, with Mitsuba's truth."""
+"""Scenes of the studies: by name or file, at about a given number of pixels, with Mitsuba's truth."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from typing import Any
 
 from ..progress import Progress
 from ..reference import Reference, reference
-from ..render import Result
-from ..scene import Scene
+from ..scene import Scene, resize_film
 from . import parity
-from .harness import Case, Method, Scenery, Shot
+from .harness import Case, Scenery
+from .methods import Stage
 from .parity import Plan
 
-__all__ = ["SIX", "every_scene", "named_scenes", "pssflow_method", "scenery", "shot_of"]
+__all__ = ["SIX", "every_scene", "named_scenes", "scenery"]
 
 SIX = (
     *("scenes/door-ajar", "scenes/courtyard", "scenes/many-lights"),
@@ -68,11 +68,20 @@ def scenery(
     def open_it() -> Case:
         import mitsuba as mi
 
-        mi.set_variant(plan.variant)
-        mi.set_log_level(mi.LogLevel.Error)
-        loaded: Any = mi.load_file(str(plan.path), optimize=False)
+        def load(variant: str) -> Any:
+            mi.set_variant(variant)
+            mi.set_log_level(mi.LogLevel.Error)
+            return mi.load_file(str(plan.path), optimize=False)
+
+        def load_resized(variant: str) -> Any:
+            loaded = load(variant)
+            resize_film(loaded, 0, None, scale)
+            return loaded
+
+        loaded = load(plan.variant)
         width, height = (int(n) for n in loaded.sensors()[0].film().crop_size())
-        scene = Scene(loaded, scale=math.sqrt(pixels / (width * height)))
+        scale = math.sqrt(pixels / (width * height))
+        scene = Scene(loaded, scale=scale)
         scene.name = plan.name
         for text in scene.notes:
             note(f"{plan.name}: {text}")
@@ -85,43 +94,7 @@ def scenery(
         def warm_up() -> None:
             scene.render("none", 1, k=k, progress=False)
 
-        return Case(digest=scene.hash, scene=scene, truth=truth, warm_up=warm_up)
+        stage = Stage(scene, load_resized)
+        return Case(digest=scene.hash, scene=stage, truth=truth, warm_up=warm_up)
 
     return Scenery(plan.name, open_it)
-
-
-def pssflow_method(guide: str, k: int, threads: int | None, **options: Any) -> Method:
-    """A guide of the registry, with its usual options or others."""
-
-    def run(scene: Scene, seed: int, times: Sequence[float], progress: Progress) -> list[Shot]:
-        whole = scene.render(
-            guide,
-            time=times[-1],
-            snapshots=times[:-1],
-            k=k,
-            threads=threads,
-            seed=seed,
-            progress=progress,
-            **options,
-        )
-        parts = (*whole.snapshots, whole)
-        return [shot_of(part, seconds) for part, seconds in zip(parts, times, strict=True)]
-
-    return Method(guide, run, options)
-
-
-def shot_of(result: Result, seconds: float) -> Shot:
-    """A render of ours as a study takes it."""
-    stats = result.stats
-    # Before its pilot is over a guide has drawn nothing: the pilot's share then is all there is.
-    drawn = stats["nonzero_share"] if stats["paths_found"] else stats["pilot"]["nonzero_share"]
-    return Shot(
-        time=seconds,
-        elapsed=stats["elapsed"],
-        image=result.image,
-        variance=result.variance,
-        spp=sum(part["spp"] for part in stats["passes"]),
-        chosen=stats["chosen"],
-        nonzero_share=drawn,
-        seconds={phase: stats["seconds"][phase] for phase in ("pilot", "fit", "render")},
-    )

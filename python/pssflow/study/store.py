@@ -28,10 +28,14 @@ class Row:
     """One image and its errors. Radiances are relative to the reference, as in relMSE (`pssflow.metrics`)."""
 
     scene: str
+    scene_hash: str
+    """Of what was rendered."""
     method: str
     seed: int
     time: float
-    """Budget in seconds; pilot, training and selection inside, loading outside."""
+    """Budget in seconds; `budget` says what is inside."""
+    budget: str
+    """What the time counts and what it does not, in words."""
     elapsed: float
     """Seconds really used."""
     longest: float
@@ -43,16 +47,22 @@ class Row:
     k: int
     emitter_strategy: str
     spp: int
-    """Samples per pixel in the image."""
+    """Samples per pixel in the image; 0 where the method had none by that time: then the errors are NaN."""
     paths: int
     seconds_pilot: float | None
     seconds_fit: float | None
     seconds_render: float | None
+    seconds_warm_up: float | None
+    """Outside of the time: compiling, where the method does."""
     nonzero_share: float | None
     """Paths that carry light, of those found."""
     relmse: float
+    relmse_error: float
+    """Standard error from the spread between pixels."""
     relmse_trimmed: float
     mape: float
+    flip: float | None
+    """Mean of HDR-FLIP; None where the package `flip-evaluator` is missing."""
     own_variance: float | None
     """The image's relMSE as predicted by its own variance, without the truth's noise."""
     reference_variance: float

@@ -14,7 +14,20 @@ from dataclasses import dataclass
 from ..metrics import Estimate, mean_and_error
 from .store import Row
 
-__all__ = ["BASELINE", "CLOSE", "Cell", "Choice", "Overall", "cells", "choices", "overall"]
+__all__ = [
+    "BASELINE",
+    "CLOSE",
+    "Cell",
+    "Choice",
+    "Overall",
+    "Reach",
+    "cells",
+    "choices",
+    "overall",
+    "reaches",
+    "targets",
+    "time_to_reach",
+]
 
 BASELINE = "none"
 """Random sampling: what all others are compared with."""
@@ -40,10 +53,15 @@ class Cell:
     relmse: Estimate
     relmse_trimmed: Estimate
     mape: Estimate
+    flip: Estimate | None
+    nonzero_share: float | None
     own_variance: Estimate | None
     reference_variance: float
+    elapsed: float
     work: Estimate
     """relMSE × seconds used."""
+    variance_time: Estimate | None
+    """Relative variance, by the image itself, × seconds used."""
     gain: Estimate | None
     """Variance per path, by the images' own."""
     cost: Estimate | None
@@ -70,9 +88,11 @@ class Cell:
 
 
 def cells(rows: Iterable[Row]) -> list[Cell]:
-    """All cells, in the order of the rows."""
+    """All cells, in the order of the rows; rows of times at which there was no image are left out."""
     groups: dict[tuple[str, str, float], list[Row]] = {}
     for row in rows:
+        if not row.spp:
+            continue
         groups.setdefault((row.scene, row.method, row.time), []).append(row)
     found = []
     for (scene, method, time), group in groups.items():
@@ -86,6 +106,8 @@ def cells(rows: Iterable[Row]) -> list[Cell]:
         variances = [row.own_variance for row in group]
         known = [v for v in variances if v is not None]
         whole = len(known) == len(group)
+        flips = [row.flip for row in group if row.flip is not None]
+        shares = [row.nonzero_share for row in group if row.nonzero_share is not None]
         base_variance = [(r.own_variance, r) for r in base or ()]
         per_path = [v * r.spp for v, r in base_variance if v is not None]
         found.append(
@@ -99,9 +121,17 @@ def cells(rows: Iterable[Row]) -> list[Cell]:
                 relmse=mean_and_error([row.relmse for row in group]),
                 relmse_trimmed=mean_and_error([row.relmse_trimmed for row in group]),
                 mape=mean_and_error([row.mape for row in group]),
+                flip=mean_and_error(flips) if len(flips) == len(group) else None,
+                nonzero_share=sum(shares) / len(shares) if shares else None,
                 own_variance=mean_and_error(known) if whole else None,
                 reference_variance=group[-1].reference_variance,
+                elapsed=sum(row.elapsed for row in group) / len(group),
                 work=mean_and_error([row.relmse * row.elapsed for row in group]),
+                variance_time=mean_and_error(
+                    [v * row.elapsed for v, row in zip(known, group, strict=True)]
+                )
+                if whole
+                else None,
                 gain=over(
                     per_path if base and len(per_path) == len(base) else None,
                     [v * r.spp for v, r in zip(known, group, strict=True)],
@@ -207,8 +237,10 @@ class Choice:
         return self.over.value - SIGNIFICANT * error <= CLOSE
 
 
-def choices(found: Sequence[Cell], name: str = "auto") -> list[Choice]:
-    """`auto` against the others, wherever both were measured."""
+def choices(
+    found: Sequence[Cell], name: str = "auto", competitors: Sequence[str] = ()
+) -> list[Choice]:
+    """`auto` against the others, wherever both were measured; `competitors` are none that it could have chosen."""
     result = []
     for cell in found:
         if cell.method != name:
@@ -217,7 +249,7 @@ def choices(found: Sequence[Cell], name: str = "auto") -> list[Choice]:
             c
             for c in found
             if (c.scene, c.time) == (cell.scene, cell.time)
-            and c.method != name
+            and c.method not in (name, *competitors)
             and c.work.value > 0.0
         ]
         if not others:
@@ -226,4 +258,84 @@ def choices(found: Sequence[Cell], name: str = "auto") -> list[Choice]:
         over = ratio(cell.work, best.work)
         if over is not None:
             result.append(Choice(cell.scene, cell.time, best.method, over))
+    return result
+
+
+@dataclass(frozen=True)
+class Reach:
+    """When a method comes to an error, on one scene."""
+
+    scene: str
+    method: str
+    target: float
+    """relMSE, mean over seeds."""
+    seconds: float | None
+    """Interpolated between two measured times; None where it lies outside of them."""
+    bound: str = ""
+    """What is known where there is no number: `< 1 s`, `> 30 s`, or `below the noise`."""
+
+    def __str__(self) -> str:
+        return self.bound if self.seconds is None else f"{self.seconds:.3g} s"
+
+
+def time_to_reach(
+    points: Sequence[tuple[float, float]], target: float, floor: float
+) -> tuple[float | None, str]:
+    """Seconds at which an error that falls through `points` (seconds, error) first comes to `target`.
+
+    Both are interpolated on logarithmic axes, where errors fall in straight lines; nothing is extrapolated, and nothing
+    is read below `floor`, the reference's own noise in the same measure.
+
+    Returns:
+        The seconds and an empty text, or None and what is known instead, as `Reach.bound`.
+    """
+    if target < floor:
+        return None, "below the noise"
+    points = sorted(points)
+    if not points:
+        return None, "no image"
+    before: tuple[float, float] | None = None
+    for seconds, error in points:
+        if error <= target:
+            if before is None:
+                # A measured hit is a hit; one below it came sooner than anything that was measured.
+                return (seconds, "") if error == target else (None, f"< {seconds:.3g} s")
+            # Below the floor an error is not known, only that it is no larger: the crossing is drawn to the floor.
+            x0, y0 = before
+            y1 = max(error, floor)
+            if y1 <= 0.0:
+                return None, f"< {seconds:.3g} s"
+            share = 1.0 if y0 == y1 else math.log(y0 / target) / math.log(y0 / y1)
+            return x0 * (seconds / x0) ** min(share, 1.0), ""
+        before = seconds, error
+    return None, f"> {points[-1][0]:.3g} s"
+
+
+def targets(found: Sequence[Cell], scene: str) -> list[float]:
+    """Errors worth asking for on a scene, largest first: those of random sampling (or the first method) at each time.
+
+    Rounded up to two digits, so that they can be read, and left out below the reference's noise.
+    """
+    own = [cell for cell in found if cell.scene == scene]
+    base = [cell for cell in own if cell.method == BASELINE]
+    base = base or [cell for cell in own if cell.method == own[0].method]
+    errors = [cell.relmse.value for cell in base if cell.relmse.value > cell.reference_variance]
+    return sorted({_rounded_up(error) for error in errors if error > 0.0}, reverse=True)
+
+
+def _rounded_up(value: float, digits: int = 2) -> float:
+    step = 10.0 ** (math.floor(math.log10(value)) - digits + 1)
+    return float(f"{math.ceil(value / step - 1e-9) * step:.{digits}g}")
+
+
+def reaches(found: Sequence[Cell], most: int = 3) -> list[Reach]:
+    """The time of each method to the scene's last few targets."""
+    result = []
+    for scene in dict.fromkeys(cell.scene for cell in found):
+        own = [cell for cell in found if cell.scene == scene]
+        for method in dict.fromkeys(cell.method for cell in own):
+            points = [(c.elapsed, c.relmse.value) for c in own if c.method == method]
+            for target in targets(found, scene)[-most:]:
+                floor = own[-1].reference_variance
+                result.append(Reach(scene, method, target, *time_to_reach(points, target, floor)))
     return result

@@ -1,0 +1,264 @@
+"""Methods of the studies by name: pssflow's guides, Mitsuba's path tracer, and a guide of another make.
+
+| name              | what it is                                                                           |
+|-------------------|--------------------------------------------------------------------------------------|
+| `none`, `auto`, … | a guide of `pssflow.guide.guide_names()`                                             |
+| `mitsuba-llvm`    | `pssflow_kbounce` in `llvm_ad_rgb`: Mitsuba's path tracer, for k-bounce light only   |
+| `mitsuba-scalar`  | the same in `scalar_rgb`, where Python is called for every path and takes most of it |
+| `python-vegas`    | Lepage's own package `vegas`, as a guide of pssflow by `guide=` object               |
+
+All of them join the light with MIS. A difference of two renders is none: it would render the directly lit scene as
+well, only to throw it away.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..guide import choose, guide_names
+from ..progress import Progress, reporting
+from ..reference import KBouncePass, Running
+from ..render import Result
+from ..scene import Scene
+from ..variants import llvm_problem
+from .harness import Method, Shot
+
+__all__ = ["OTHERS", "Stage", "method_names", "missing", "named_method", "shot_of"]
+
+MITSUBA = {"mitsuba-llvm": "llvm_ad_rgb", "mitsuba-scalar": "scalar_rgb"}
+"""Name → Mitsuba's variant."""
+
+VEGAS = "python-vegas"
+
+OTHERS = (*MITSUBA, VEGAS)
+"""Methods that are no guide of pssflow's own."""
+
+PATHS_PER_PASS = 1 << 18
+"""Of Mitsuba, about: a wavefront that is worth its overhead, and many to a second."""
+
+SHARE_OF_FIRST = 0.25
+"""Of the shortest time that a pass may take, if its samples can be fewer: what does not fit any more is lost."""
+
+
+@dataclass
+class Stage:
+    """A scene that all methods can render: ours, and Mitsuba's in whatever variant a method needs."""
+
+    scene: Scene
+    load: Callable[[str], Any]
+    """Sets a variant of Mitsuba and loads the scene in it, with the film's size of `scene`."""
+    loaded: dict[str, Any] = field(default_factory=dict)
+    too_slow: set[str] = field(default_factory=set)
+    """Methods that could not finish a pass in their time: other seeds need not try."""
+
+    def in_variant(self, variant: str) -> Any:
+        """The `mi.Scene`, loaded once. Sets the variant."""
+        import mitsuba as mi
+
+        mi.set_variant(variant)
+        if variant == self.scene.variant:
+            return self.scene.mi_scene
+        if variant not in self.loaded:
+            self.loaded[variant] = self.load(variant)
+        return self.loaded[variant]
+
+
+def method_names() -> list[str]:
+    """All that `--guides` of a study understands; guides may be joined by `+`."""
+    return [*guide_names(), *OTHERS]
+
+
+def missing(name: str) -> str | None:
+    """Why a method cannot be used on this machine; None if it can.
+
+    Raises:
+        ValueError: there is no method of that name.
+    """
+    from importlib.util import find_spec
+
+    if name == "mitsuba-llvm":
+        return llvm_problem()
+    if name == VEGAS:
+        if find_spec("vegas") is None:
+            return "the package `vegas` is not installed; pip install 'pssflow[studies]'"
+        return None
+    if name not in MITSUBA:
+        try:
+            choose(name, {})
+        except ValueError as error:
+            raise ValueError(f"{error}; studies also know {', '.join(OTHERS)}") from None
+    return None
+
+
+def named_method(name: str, k: int, threads: int | None) -> Method:
+    """The method of that name."""
+    if name in MITSUBA:
+        return _mitsuba(name, MITSUBA[name], k, threads)
+    if name == VEGAS:
+        from importlib.metadata import version
+
+        from .vegas_guide import VegasGuide
+
+        return _pssflow(name, VegasGuide, k, threads, {"vegas": version("vegas")})
+    return _pssflow(name, lambda: name, k, threads, {})
+
+
+def _pssflow(
+    name: str,
+    guide: Callable[[], Any],
+    k: int,
+    threads: int | None,
+    options: Mapping[str, Any],
+) -> Method:
+    """A guide, made anew for each run; one render with snapshots."""
+
+    def run(stage: Stage, seed: int, times: Sequence[float], progress: Progress) -> list[Shot]:
+        whole = stage.scene.render(
+            guide(),
+            time=times[-1],
+            snapshots=times[:-1],
+            k=k,
+            threads=threads,
+            seed=seed,
+            progress=progress,
+        )
+        parts = (*whole.snapshots, whole)
+        return [shot_of(part, seconds) for part, seconds in zip(parts, times, strict=True)]
+
+    inside = "rendering" if name == "none" else "pilot, training, selection and rendering"
+    return Method(name, run, options, budget=f"{inside} inside; loading and BVH outside")
+
+
+def shot_of(result: Result, seconds: float) -> Shot:
+    """A render of ours as a study takes it."""
+    stats = result.stats
+    # Before its pilot is over a guide has drawn nothing: the pilot's share then is all there is.
+    drawn = stats["nonzero_share"] if stats["paths_found"] else stats["pilot"]["nonzero_share"]
+    return Shot(
+        time=seconds,
+        elapsed=stats["elapsed"],
+        image=result.image,
+        variance=result.variance,
+        spp=sum(part["spp"] for part in stats["passes"]),
+        chosen=stats["chosen"],
+        nonzero_share=drawn,
+        seconds={phase: stats["seconds"][phase] for phase in ("pilot", "fit", "render")},
+    )
+
+
+def _mitsuba(name: str, variant: str, k: int, threads: int | None) -> Method:
+    """Mitsuba's path tracer for k-bounce light, in passes until the time is over."""
+
+    def run(stage: Stage, seed: int, times: Sequence[float], progress: Progress) -> list[Shot]:
+        if name in stage.too_slow:
+            return []
+        if stage.scene.hide_emitters:
+            raise ValueError("`hide_emitters` is set, which pssflow_kbounce does not know")
+        before = stage.scene.variant
+        try:
+            scene = stage.in_variant(variant)
+            one = KBouncePass(scene, 0, k)
+            try:
+                with _threads(threads), reporting(progress) as listener:
+                    shots = _passes(one, name, seed, stage.scene, times, listener)
+            finally:
+                one.restore()
+        finally:
+            import mitsuba as mi
+
+            mi.set_variant(before)
+        if not shots:
+            stage.too_slow.add(name)
+        return shots
+
+    budget = "rendering inside; loading and compiling outside"
+    return Method(name, run, {"integrator": "pssflow_kbounce", "variant": variant}, budget=budget)
+
+
+def _passes(
+    render: KBouncePass,
+    name: str,
+    seed: int,
+    scene: Scene,
+    times: Sequence[float],
+    listener: Callable[[str, float], None] | None,
+) -> list[Shot]:
+    """Whole passes, none of which ends after its time; the snapshot at a time is what there was then."""
+    pixels = scene.width * scene.height
+    spp = max(PATHS_PER_PASS // pixels, 1) if render.jit else 1
+    # References count from 0, and must not share a number with what they measure.
+    first = (seed + 1) << 20
+    start = time.perf_counter()
+    longest = 0.0
+
+    def measure(spp: int) -> float:
+        """Seconds of a pass: its first one compiles, its second one tells."""
+        render(first - 1, spp)
+        begun = time.perf_counter()
+        render(first - 2, spp)
+        return time.perf_counter() - begun
+
+    if render.jit:
+        longest = measure(spp)
+        fitting = SHARE_OF_FIRST * times[0] / longest if longest > 0.0 else 1.0
+        if fitting < 1.0 and spp > 1:
+            spp = max(int(spp * fitting), 1)
+            longest = measure(spp)
+    warm_up = time.perf_counter() - start
+    state = Running.empty([scene.width, scene.height], spp)
+    elapsed = 0.0
+    shots: list[Shot | None] = []
+
+    def shoot(until: float) -> None:
+        """Snapshots of what there is, at all times before this one."""
+        while len(shots) < len(times) and times[len(shots)] < until:
+            shots.append(None if not state.passes else shot(times[len(shots)]))
+
+    def shot(at: float) -> Shot:
+        return Shot(
+            time=at,
+            elapsed=elapsed,
+            image=state.mean.astype(np.float32),
+            variance=state.variance().astype(np.float32) if state.passes > 1 else None,
+            spp=state.spp,
+            chosen=name,
+            seconds={"render": elapsed, "warm_up": warm_up},
+        )
+
+    while elapsed + longest <= times[-1]:
+        begun = time.perf_counter()
+        image, drawn, bad = render(first + state.passes, spp)
+        after = state.with_pass(image, spp=drawn, non_finite=bad, seconds=0.0)
+        took = time.perf_counter() - begun
+        longest = max(0.9 * longest, took)
+        shoot(elapsed + took)
+        if elapsed + took > times[-1]:
+            break
+        # What snapshots take is between the passes, and not the method's.
+        state, elapsed = after, elapsed + took
+        if listener is not None:
+            listener("render", elapsed / times[-1])
+    shoot(float("inf"))
+    return [taken for taken in shots if taken is not None]
+
+
+@contextmanager
+def _threads(threads: int | None) -> Iterator[None]:
+    """Size of Mitsuba's pool for a while."""
+    import drjit as dr
+
+    if threads is None:
+        yield
+        return
+    dr.set_thread_count(threads)
+    try:
+        yield
+    finally:
+        dr.set_thread_count(os.cpu_count() or 1)
