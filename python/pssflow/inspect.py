@@ -72,7 +72,7 @@ class AtPixel:
     best: Array
     """√(mean f²) over (u₀, u₁), scaled to mean 1: the density of least variance."""
     reach: float
-    """Radius of the disk of directions: 1 for the hemisphere, √2 for the sphere where the surface lets light through."""
+    """Radius of the disk of directions: 1 for the hemisphere, √2 for the sphere where a surface lets light through."""
     f_directions: Array
     """f a steradian of the direction at x₁, (DISK, DISK), W·sr⁻²·m⁻²; NaN outside the disk."""
     best_directions: Array
