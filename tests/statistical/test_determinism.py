@@ -92,12 +92,11 @@ def test_spp_is_replayed(guide: str) -> None:
 
 @pytest.mark.parametrize("guide", ["table", "mixture-net", "auto"])
 def test_guides_refined_from_pass_to_pass_are_replayed(guide: str) -> None:
-    """Each pass was drawn by what the passes before it taught, and `auto` may have chosen anew: all of it comes back."""
-    options = {"k": 3, "combine": "variance"}
-    asked = _render(guide, spp=40, threads=2, **options)
+    """Each pass was drawn by what the passes before it taught, and `auto` may have chosen anew: all comes back."""
+    asked = _render(guide, spp=96, threads=2, combine="variance")
     passes = asked["record"]["passes"]
     assert sum(p["fit"] for p in passes) > 1, passes
-    _assert_equal(asked, _render(guide, replay=passes, threads=3, **options))
+    _assert_equal(asked, _render(guide, replay=passes, threads=3, combine="variance"))
 
 
 @pytest.mark.parametrize("k", range(1, 7))
