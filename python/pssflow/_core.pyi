@@ -152,9 +152,9 @@ class Scene:
         "guide_options", "spp", "time", "snapshots", "replay", "uniform_fraction", "pilot_spp" and "combine" may be left
         out; one of spp, time and replay must be there.
 
-        A pass is {"kind": "pilot|guided|uniform", "spp": samples per pixel, "record": share of the light-carrying paths
-        kept for training, "fit": whether the guide was fitted anew before it}, and if guided also {"guide": name of what
-        drew it, "a": its share of uniform paths}. Only kind and spp must be given.
+        A pass is {"kind": "pilot|guided|uniform", "spp": samples per pixel, "record": share of the light-carrying
+        paths kept for training, "fit": whether the guide was fitted anew before it}, and if guided also {"guide": name
+        of what drew it, "a": its share of uniform paths}. Only kind and spp must be given.
 
         Returns image (h,w,3), variance (h,w,3) [variance of the mean], found and nonzero (h,w) uint32 [per pixel,
         over all paths in the image], and "record": JSON string with
@@ -166,11 +166,12 @@ class Scene:
          "training": {"loss","seconds","dropped_nonfinite","outliers_removed","trained_on","samples",
          "guide": its `describe`} or null, "seconds": {"pilot","fit","render"},
          "elapsed": seconds of all phases and between them},
-        "guide": Guide, the object that was given, or None, and "snapshots": a list of the same, each with the "time" that was asked for.
+        "guide": Guide, the object that was given, or None, and "snapshots": a list of the same, each with the "time"
+        that was asked for.
         """
     # For parity tests: values of single plugins.
     def ray_intersect(self, origins: F32, directions: F32) -> dict[str, NDArray[Any]]:
-        """Per ray: valid (n,), p, n, sh_n (n,3), uv (n,2), shape (n,) index, sh_s (n,3) uv-frame tangent, dp_dv (n,3)."""
+        """Per ray: valid (n,), p, n, sh_n, dp_dv (n,3), uv (n,2), shape (n,) index, sh_s (n,3) uv-frame tangent."""
     def bsdf_eval_pdf(self, bsdf: int, uv: F32, wi: F32, wo: F32) -> tuple[F32, F32]:
         """Local directions (z = normal): value·cos (n,3) and pdf (n,)."""
     def bsdf_sample(
