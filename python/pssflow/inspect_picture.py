@@ -48,13 +48,13 @@ def draw_pixel(found: AtPixel, path: str | Path) -> None:
     below = (
         "the dashed circle the horizon, the rim straight below" if sphere else "the rim the horizon"
     )
-    figure.supxlabel(
+    caption = (
         f"Directions at x₁ = ({', '.join(f'{v:.3g}' for v in found.position)}), "
         f"normal ({', '.join(f'{v:.2f}' for v in found.normal)}): equal-area projection, the normal in the middle, "
-        f"{below}; such as meet another surface.\nDensities are the mixture m = a + (1 − a) q that paths are drawn "
-        "from; best is the density of least variance, ∝ √mean f².",
-        fontsize=8,
+        f"{below}; such as meet another surface. Densities are the mixture m = a + (1 − a) q that paths are drawn "
+        "from; best is the density of least variance, ∝ √mean f²."
     )
+    figure.supxlabel(textwrap.fill(caption, 42 * columns), fontsize=8)
     shown = _numbers(axes[0][0], found.f, "f, mean over other numbers", _linear(found.f))
     _bar(figure, axes[0][0], "W·sr⁻¹·m⁻²", shown)
     values = found.f_directions
