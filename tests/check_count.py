@@ -2,8 +2,9 @@
 
     python tests/check_count.py python-quick=out/tests/python rust-quick=out/tests/rust.log
 
-A Python report is a folder of pytest's JUnit XML files, a Rust one the output of `cargo test`. Tests that ran and failed count as run.
-Skipped ones do not, unless their reason names PSSFLOW_SCENES, the folder of third-party scenes that a machine may lack.
+A Python report is a folder of pytest's JUnit XML files, a Rust one the output of `cargo test`. Tests that ran and
+failed count as run. Skipped ones do not, unless their reason names PSSFLOW_SCENES, the folder of third-party scenes
+that a machine may lack.
 """
 
 from __future__ import annotations

@@ -72,7 +72,7 @@ class Guide:
     @property
     def mass_outside(self) -> float: ...
     def describe(self) -> str:
-        """JSON: configuration and training."""
+        """JSON: configuration and training; `memory` is what it holds, in bytes."""
 
 class Scene:
     """A scene that can be traced, built from `pssflow.export`."""
@@ -141,25 +141,37 @@ class Scene:
     ) -> dict[str, Any]:
         """Renders. `options` is JSON:
 
-        {"guide": "none" | name of the registry | "ready" (the fitted `guide`) | "foreign" (the object `guide`),
+        {"guide": "none" | "auto" | names of the registry joined by `+`, or an alias | "ready" (the fitted `guide`)
+         | "foreign" (the object `guide`),
          "guide_options": {...}, "k": 2, "parametrisation": "bsdf|cosine|uniform",
          "emitter_strategy": "mis|nee", "spp": N or null, "time": seconds or null,
-         "snapshots": [shorter times],
-         "replay": [{"kind": "pilot|guided|uniform", "spp": n, "record": share}, ...] or null,
-         "uniform_fraction": a or null, "pilot_spp": n or null, "keep_pilot": true, "seed": 0, "threads": 0}
+         "snapshots": [shorter times], "replay": [passes of a record] or null,
+         "uniform_fraction": a or null, "pilot_spp": n or null, "keep_pilot": true,
+         "combine": "samples|variance", "seed": 0, "threads": 0}
+
+        "guide_options", "spp", "time", "snapshots", "replay", "uniform_fraction", "pilot_spp" and "combine" may be left
+        out; one of spp, time and replay must be there.
+
+        A pass is {"kind": "pilot|guided|uniform", "spp": samples per pixel, "record": share of the light-carrying
+        paths kept for training, "fit": whether the guide was fitted anew before it}, and if guided also {"guide": name
+        of what drew it, "a": its share of uniform paths}. Only kind and spp must be given.
 
         Returns image (h,w,3), variance (h,w,3) [variance of the mean], found and nonzero (h,w) uint32 [per pixel,
         over all paths in the image], and "record": JSON string with
-        {"chosen", "a", "k", "parametrisation", "emitter_strategy", "seed", "threads", "camera_rays", "paths_found",
-         "nonzero", "nonzero_share", "outside", "non_finite", "pilot": {same counts}, "mean": [r,g,b],
+        {"chosen", "a", "k", "parametrisation", "emitter_strategy", "combine", "seed", "threads", "camera_rays",
+         "paths_found", "nonzero", "nonzero_share", "outside", "non_finite", "pilot": {same counts}, "mean": [r,g,b],
          "variance": relMSE's formula with the own variance of the mean, "max_weight", "max_contribution", "ess",
-         "passes": [{"kind","spp","record"}], "notes": [str], "training": {...}, "seconds": {"pilot","fit","render"},
+         "passes": [pass], "candidates": what `auto` considered, [{"name","a","predicted_gain","cost_ratio",
+         "training_share","net_gain","chosen","why"}] or null, "notes": [str],
+         "training": {"loss","seconds","dropped_nonfinite","outliers_removed","trained_on","samples",
+         "guide": its `describe`} or null, "seconds": {"pilot","fit","render"},
          "elapsed": seconds of all phases and between them},
-        "guide": Guide | None, and "snapshots": a list of the same, each with the "time" that was asked for.
+        "guide": Guide, the object that was given, or None, and "snapshots": a list of the same, each with the "time"
+        that was asked for.
         """
     # For parity tests: values of single plugins.
     def ray_intersect(self, origins: F32, directions: F32) -> dict[str, NDArray[Any]]:
-        """Per ray: valid (n,), p, n, sh_n (n,3), uv (n,2), shape (n,) index, sh_s (n,3) uv-frame tangent."""
+        """Per ray: valid (n,), p, n, sh_n, dp_dv (n,3), uv (n,2), shape (n,) index, sh_s (n,3) uv-frame tangent."""
     def bsdf_eval_pdf(self, bsdf: int, uv: F32, wi: F32, wo: F32) -> tuple[F32, F32]:
         """Local directions (z = normal): value·cos (n,3) and pdf (n,)."""
     def bsdf_sample(
@@ -191,6 +203,13 @@ def guide_aliases() -> str:
 
 def guides() -> str:
     """JSON list of the registry: [{"name", "summary", "options": {default options}}]."""
+
+def read_exr(path: str) -> dict[str, F32]:
+    """Channels (h,w) of an EXR's first part by their full names: R, variance.R. On the calling thread alone.
+
+    Raises:
+        ValueError: it is missing, no EXR, damaged, or of a kind that is not understood.
+    """
 
 def write_exr(path: str, layers: dict[str, F32]) -> None:
     """Writes layers (name -> (h,w,3)) as one-part f32 EXR with dotted channel names; key "" is the image."""

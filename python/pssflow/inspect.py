@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from .guide import LUMINANCE, Guide
 from .options import check_integer
-from .progress import Progress
 from .render import Result
 from .scene import Scene
 
@@ -26,11 +25,12 @@ __all__ = ["AtPixel", "Fitted", "ImageMaps", "MapRow", "at_pixel", "over_image"]
 
 F32 = NDArray[np.float32]
 Array = NDArray[Any]
+Settings = Mapping[str, Mapping[str, Any]]
 
 GRID = 64
 """Steps along each of the two numbers."""
 
-DISK = 48
+DISK = 64
 """Steps across the disk of directions."""
 
 PATHS_A_CELL = 64
@@ -71,8 +71,12 @@ class AtPixel:
     """Luminance of f over (u₀, u₁), (GRID, GRID), rows along u₁, W·sr⁻¹·m⁻²; the mean is the pixel's radiance."""
     best: Array
     """√(mean f²) over (u₀, u₁), scaled to mean 1: the density of least variance."""
+    reach: float
+    """Radius of the disk of directions: 1 for the hemisphere, √2 for the sphere where a surface lets light through."""
     f_directions: Array
     """f a steradian of the direction at x₁, (DISK, DISK), W·sr⁻²·m⁻²; NaN outside the disk."""
+    best_directions: Array
+    """The density of least variance over directions, (DISK, DISK), sr⁻¹; NaN outside the disk."""
     guides: list[Fitted]
 
     def draw(self, path: str | Path) -> None:
@@ -130,10 +134,7 @@ def at_pixel(
     *,
     spp: int = 16,
     k: int = 2,
-    seed: int = 0,
-    threads: int | None = None,
-    progress: Progress = False,
-    settings: Mapping[str, Mapping[str, Any]] | None = None,
+    settings: Settings | None = None,
     **options: Any,
 ) -> AtPixel:
     """Looks at the surface seen at a pixel's centre: 64 × 64 × 64 paths, and a render a guide.
@@ -144,11 +145,8 @@ def at_pixel(
         guides: names of guides; each is fitted by a render of `spp`.
         spp: samples per pixel of these renders.
         k: bounces, at least 2: with one, no direction is drawn.
-        seed: of all random numbers.
-        threads: None for all cores.
-        progress: of the renders; as in `pssflow.render`.
         settings: options of each guide, by guide.
-        **options: further arguments of `pssflow.render`.
+        **options: further arguments of `pssflow.render`, whose `progress` is off by default.
 
     Raises:
         ValueError: the pixel lies outside of the film or sees no surface, or an argument is wrong.
@@ -156,7 +154,9 @@ def at_pixel(
     _check_bounces(k)
     x, y = _check_pixel(scene, pixel)
     strategy = _strategy(options)
-    u, surface = _paths_at(scene, (x, y), k, strategy, seed, threads)
+    u, surface = _paths_at(
+        scene, (x, y), k, strategy, options.get("seed", 0), options.get("threads")
+    )
     position, normal = _surface(surface, (x, y))
 
     luminance = (surface.f @ LUMINANCE).astype(np.float64)
@@ -166,9 +166,10 @@ def at_pixel(
     disk = _Disk(onward, known, normal)
     square = _by_cell(luminance**2)
     best = np.sqrt(square)
+    best /= max(best.mean(), np.finfo(np.float64).tiny)
     fitted: list[Fitted] = []
     for name in guides:
-        result = _render(scene, name, spp, k, seed, threads, progress, settings, options)
+        result = _render(scene, name, settings, spp=spp, k=k, **options)
         q = _direction_density(result, u[:, : 2 * k + 1], surface, (x, y), scene)
         a = float(result.stats["a"])
         mixture = a + (1 - a) * q if isinstance(result.guide, Guide) else np.ones(len(u))
@@ -183,15 +184,17 @@ def at_pixel(
             )
         )
     return AtPixel(
-        scene=scene.name,
+        scene=_title(scene),
         pixel=(x, y),
         k=k,
         spp=spp,
         position=position,
         normal=normal,
         f=_by_cell(luminance),
-        best=best / max(best.mean(), np.finfo(np.float64).tiny),
+        best=best,
+        reach=disk.reach,
         f_directions=disk.density(luminance),
+        best_directions=disk.density(np.repeat(best.ravel(), PATHS_A_CELL)),
         guides=fitted,
     )
 
@@ -202,10 +205,7 @@ def over_image(
     *,
     spp: int = 16,
     k: int = 2,
-    seed: int = 0,
-    threads: int | None = None,
-    progress: Progress = False,
-    settings: Mapping[str, Mapping[str, Any]] | None = None,
+    settings: Settings | None = None,
     **options: Any,
 ) -> ImageMaps:
     """Renders with random numbers and with each guide, at equal samples, and says where a guide pays.
@@ -215,23 +215,20 @@ def over_image(
         guides: names of guides.
         spp: samples per pixel of each render, a guide's pilot inside; at least 4.
         k: bounces.
-        seed: of all random numbers.
-        threads: None for all cores.
-        progress: of the renders; as in `pssflow.render`.
         settings: options of each guide, by guide.
-        **options: further arguments of `pssflow.render`.
+        **options: as in `at_pixel`.
 
     Raises:
         ValueError: an argument is wrong.
     """
     if spp < 4:
         raise ValueError(f"`spp` = {spp}: a variance for each pixel takes at least 4")
-    random = _render(scene, "none", spp, k, seed, threads, progress, None, options)
+    random = _render(scene, "none", None, spp=spp, k=k, **options)
     before = _smooth(_variance(random))
     mean = _smooth((random.image @ LUMINANCE).astype(np.float64))
     rows: list[MapRow] = []
     for name in guides:
-        result = _render(scene, name, spp, k, seed, threads, progress, settings, options)
+        result = _render(scene, name, settings, spp=spp, k=k, **options)
         after = _smooth(_variance(result))
         lit = (before > 0) & (after > 0)
         rows.append(
@@ -246,13 +243,13 @@ def over_image(
                     _variance(random).sum()
                     / max(_variance(result).sum(), np.finfo(np.float64).tiny)
                 ),
-                cells=_cells(scene, result, k, _strategy(options), threads),
+                cells=_cells(scene, result, k, _strategy(options), options.get("threads")),
             )
         )
     lit = mean > 0
     error = np.sqrt(before) / np.where(lit, mean, 1)
     return ImageMaps(
-        scene=scene.name,
+        scene=_title(scene),
         k=k,
         spp=spp,
         image=random.image,
@@ -315,21 +312,15 @@ def _surface(surface: Any, pixel: tuple[int, int]) -> tuple[F32, F32]:
     return surface.position[first, 0], surface.normal[first, 0]
 
 
-def _render(
-    scene: Scene,
-    name: str,
-    spp: int,
-    k: int,
-    seed: int,
-    threads: int | None,
-    progress: Progress,
-    settings: Mapping[str, Mapping[str, Any]] | None,
-    options: Mapping[str, Any],
-) -> Result:
-    own = (settings or {}).get(name, {})
-    return scene.render(
-        name, spp, k=k, seed=seed, threads=threads, progress=progress, **options, **own
-    )
+def _title(scene: Scene) -> str:
+    """The scene's name in a title: of a file its own, or its folder's where all files have the same."""
+    path = Path(scene.name)
+    named = path.parent.name if path.stem == "scene" else path.stem
+    return named if path.suffix == ".xml" and named else scene.name
+
+
+def _render(scene: Scene, name: str, settings: Settings | None, **options: Any) -> Result:
+    return scene.render(name, **{"progress": False, **options, **(settings or {}).get(name, {})})
 
 
 def _training(result: Result) -> str:
@@ -337,7 +328,8 @@ def _training(result: Result) -> str:
     chosen = result.stats["chosen"]
     if result.guide is None:
         return "random numbers"
-    return f"{chosen}, a = {result.stats['a']:g}"
+    named = "" if chosen == result.stats["guide"] else f"{chosen}, "
+    return f"{named}a = {result.stats['a']:g}"
 
 
 def _direction_density(
@@ -377,10 +369,14 @@ def _by_cell(values: Array) -> Array:
 
 
 class _Disk:
-    """Directions in Lambert's azimuthal equal-area projection, the normal in the middle, the whole sphere around it.
+    """Directions in Lambert's azimuthal equal-area projection, the normal in the middle.
 
-    The hemisphere is the disk of radius 1; below it, where a surface lets light through, reach radii up to √2.
+    The hemisphere is the disk of radius 1. Where more than a few directions go below the surface, as through glass,
+    the whole sphere is shown, whose radius is √2; few, which rounding or a bent normal sends there, are left out.
     """
+
+    FEW = 0.01
+    """Share of directions below the surface that do not make the disk larger."""
 
     def __init__(self, directions: F32, known: NDArray[np.bool_], normal: F32) -> None:
         n = normal / np.linalg.norm(normal)
@@ -390,26 +386,28 @@ class _Disk:
         right /= np.linalg.norm(right)
         up = np.cross(n, right)
         cosine = np.clip(directions @ n, -1.0, 1.0)
-        radius = np.sqrt(np.maximum(1.0 - cosine, 0.0))
+        below = np.count_nonzero(cosine[known] < 0) > self.FEW * np.count_nonzero(known)
+        self.reach = float(np.sqrt(2)) if below else 1.0
+        radius = np.sqrt(1.0 - cosine)
         across, along = directions @ right, directions @ up
         length = np.maximum(np.hypot(across, along), 1e-12)
-        known = known & (radius <= 1.0)
         step = np.array([radius * across / length, radius * along / length])
-        index = np.clip(((step + 1.0) * 0.5 * DISK).astype(np.int64), 0, DISK - 1)
-        self.index = np.where(known, index[1] * DISK + index[0], DISK * DISK)
-        grid = (np.arange(DISK) + 0.5) / DISK * 2 - 1
-        self.outside = np.hypot(grid[None, :], grid[:, None]) > 1.0
+        index = np.clip(((step / self.reach + 1.0) * 0.5 * DISK).astype(np.int64), 0, DISK - 1)
+        shown = known & (radius <= self.reach * (1 + 1e-6))
+        self.index = np.where(shown, index[1] * DISK + index[0], DISK * DISK)
+        # A cell on the rim lies in the disk in part only: as many of 8 × 8 points in it.
+        fine = (np.arange(8 * DISK) + 0.5) / (4 * DISK) - 1
+        inside = np.hypot(fine[None, :], fine[:, None]) <= 1.0
+        share = inside.reshape(DISK, 8, DISK, 8).mean(axis=(1, 3))
+        # The disk of area π stands for the hemisphere of 2π: an area on it is half as many steradians.
+        self.steradians = share * 2.0 * (2.0 * self.reach / DISK) ** 2
 
     def density(self, values: Array) -> Array:
-        """Means over paths of `values`, a steradian, rows from below to above.
-
-        The disk of area π stands for the hemisphere of 2π: an area on it is half as many steradians.
-        """
+        """Means over paths of `values`, a steradian, (DISK, DISK), rows from below to above; NaN outside."""
         sums = np.bincount(self.index, weights=values, minlength=DISK * DISK + 1)[: DISK * DISK]
-        steradians = 2.0 * (2.0 / DISK) ** 2
-        shown = sums.reshape(DISK, DISK) / (len(values) * steradians)
-        shown[self.outside] = np.nan
-        return shown
+        within = self.steradians > 0
+        mean = sums.reshape(DISK, DISK) / len(values)
+        return np.where(within, mean / np.where(within, self.steradians, 1), np.nan)
 
 
 def _cells(

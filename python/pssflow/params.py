@@ -9,24 +9,41 @@ from typing import Any, NamedTuple
 import click
 
 
-class Size(click.ParamType):
+class Text(click.ParamType):
+    """Reads text; what is none, such as a default, is a value already."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The value of a text."""
+        if not isinstance(value, str):
+            return value
+        try:
+            return self.read(value)
+        except ValueError as error:
+            self.fail(str(error), param, ctx)
+
+    def read(self, text: str) -> Any:
+        """The value.
+
+        Raises:
+            ValueError: there is none; the message is what the user reads.
+        """
+        raise NotImplementedError
+
+
+class Size(Text):
     """WxH in pixels."""
 
     name = "WxH"
 
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[int, int]:
+    def read(self, text: str) -> tuple[int, int]:
         """Two whole numbers; `pssflow.Scene` checks their range."""
-        if isinstance(value, tuple):
-            return value
-        match = re.fullmatch(r"(\d{1,6})[xX×](\d{1,6})", str(value))
+        match = re.fullmatch(r"(\d{1,6})[xX×](\d{1,6})", text)
         if not match:
-            self.fail(f"{value!r} is no film size; expected WIDTHxHEIGHT, as 640x480", param, ctx)
+            raise ValueError(f"{text!r} is no film size; expected WIDTHxHEIGHT, as 640x480")
         return int(match[1]), int(match[2])
 
 
-class Positive(click.ParamType):
+class Positive(Text):
     """A finite number above zero."""
 
     name = "number"
@@ -35,39 +52,29 @@ class Positive(click.ParamType):
         self.meaning = meaning
         self.largest = largest
 
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> float:
+    def read(self, text: str) -> float:
         """Refuses zero, negative numbers, NaN and infinity."""
         try:
-            number = float(value)
+            number = float(text)
         except ValueError:
             number = -1.0
         if not 0.0 < number <= self.largest:
-            self.fail(
-                f"{value!r} is no {self.meaning}; expected a number above 0 and at most {self.largest:g}",
-                param,
-                ctx,
+            raise ValueError(
+                f"{text!r} is no {self.meaning}; expected a number above 0 and at most {self.largest:g}"
             )
         return number
 
 
-class SceneParameter(click.ParamType):
+class SceneParameter(Text):
     """key=value for a scene's `$key`."""
 
     name = "key=value"
 
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[str, str]:
+    def read(self, text: str) -> tuple[str, str]:
         """The two sides of the first `=`."""
-        if isinstance(value, tuple):
-            return value
-        match = re.fullmatch(r"([A-Za-z_]\w*)=(.*)", str(value), re.DOTALL)
+        match = re.fullmatch(r"([A-Za-z_]\w*)=(.*)", text, re.DOTALL)
         if not match:
-            self.fail(
-                f"{value!r} is no parameter; expected key=value, as resolution=128", param, ctx
-            )
+            raise ValueError(f"{text!r} is no parameter; expected key=value, as resolution=128")
         return match[1], match[2]
 
 
@@ -79,43 +86,33 @@ class GuideOption(NamedTuple):
     value: Any
 
 
-class GuideSetting(click.ParamType):
+class GuideSetting(Text):
     """guide.option=value; the value is read as JSON, and as text where it is none."""
 
     name = "guide.option=value"
 
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> GuideOption:
+    def read(self, text: str) -> GuideOption:
         """Splits at the first `=` and the last `.` before it."""
-        if isinstance(value, GuideOption):
-            return value
-        match = re.fullmatch(r"([\w-]+)\.(\w+)=(.+)", str(value), re.DOTALL)
+        match = re.fullmatch(r"([\w-]+)\.(\w+)=(.+)", text, re.DOTALL)
         if not match:
-            self.fail(
-                f"{value!r} is no guide option; expected guide.option=value, as realnvp.epochs=7",
-                param,
-                ctx,
+            raise ValueError(
+                f"{text!r} is no guide option; expected guide.option=value, as realnvp.epochs=7"
             )
         return GuideOption(match[1], match[2], _value(match[3]))
 
 
-class GuideNames(click.ParamType):
+class GuideNames(Text):
     """Guides joined by commas."""
 
     name = "names"
 
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[str, ...]:
+    def read(self, text: str) -> tuple[str, ...]:
         """At least one, none of them twice."""
-        if isinstance(value, tuple):
-            return value
-        names = tuple(name.strip() for name in str(value).split(","))
+        names = tuple(name.strip() for name in text.split(","))
         if not all(names):
-            self.fail(f"{value!r} names no guide; expected names joined by commas", param, ctx)
+            raise ValueError(f"{text!r} names no guide; expected names joined by commas")
         if len(set(names)) < len(names):
-            self.fail(f"{value!r} names a guide twice", param, ctx)
+            raise ValueError(f"{text!r} names a guide twice")
         return names
 
 

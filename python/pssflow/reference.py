@@ -225,18 +225,15 @@ def read_exr(path: str | Path) -> Reference:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: there is no such file")
-    try:
-        layers = dict(mi.Bitmap(str(path)).split())
-    except RuntimeError as error:
-        raise ValueError(f"{path}: cannot be read as an image: {first_line(error)}") from None
-    root = layers.get("<root>") or next(iter(layers.values()))
-    image = _rgb(root)
-    variance = _rgb(layers["variance"]) if "variance" in layers else np.zeros_like(image)
+    image, variance = _read_ours(path) or _read_theirs(path)
+    known = variance is not None
+    if variance is None:
+        variance = np.zeros_like(image)
     for what, values in (("image", image), ("variance", variance)):
         bad = values.size - int(np.count_nonzero(np.isfinite(values)))
         if bad:
             raise ValueError(f"{path}: {bad} values of its {what} are not finite")
-    note = f"read from {path}" + ("" if "variance" in layers else ", its own noise unknown")
+    note = f"read from {path}" + ("" if known else ", its own noise unknown")
     return Reference(image, variance, passes=0, spp=0, seconds=0.0, note=note, path=path)
 
 
@@ -491,6 +488,36 @@ def _save(path: Path | None, total: Running) -> None:
             np.savez(file, format=FORMAT, **vars(total))
 
     write_beside(path, write)
+
+
+def _read_ours(path: Path) -> tuple[F32, F32 | None] | None:
+    """Image and variance of an EXR that has R, G and B, as ours have; None for any other file.
+
+    Mitsuba's reader works on several threads, and waits for ever where only one core is usable.
+    """
+    from . import _core
+
+    try:
+        channels = _core.read_exr(str(path))
+    except ValueError:
+        return None
+    if not all(name in channels for name in "RGB"):
+        return None
+    image = np.stack([channels[name] for name in "RGB"], axis=2)
+    names = [f"variance.{name}" for name in "RGB"]
+    if not all(name in channels for name in names):
+        return image, None
+    return image, np.stack([channels[name] for name in names], axis=2)
+
+
+def _read_theirs(path: Path) -> tuple[F32, F32 | None]:
+    """Image and variance of whatever else Mitsuba reads."""
+    try:
+        layers = dict(mi.Bitmap(str(path)).split())
+    except RuntimeError as error:
+        raise ValueError(f"{path}: cannot be read as an image: {first_line(error)}") from None
+    root = layers.get("<root>") or next(iter(layers.values()))
+    return _rgb(root), _rgb(layers["variance"]) if "variance" in layers else None
 
 
 def _rgb(bitmap: Any) -> F32:

@@ -14,8 +14,9 @@ from tests.conftest import LLVM
 from tests.scenes import SCENES
 from tests.support.core import core_scene, render
 
-GUIDES = ("none", "realnvp", "realnvp-logit")
-LEARNED = {"epochs": 2, "samples": 4096}
+GUIDES = ("none", "realnvp", "realnvp-logit", "table", "mixture-net", "auto")
+FLOW = {"epochs": 2, "samples": 4096}
+LEARNED = {"realnvp": FLOW, "realnvp-logit": FLOW, "mixture-net": {"epochs": 1}}
 COUNTS = (
     "camera_rays",
     "paths_found",
@@ -37,7 +38,7 @@ def _scene() -> _core.Scene:
 
 
 def _render(guide: str, **options: Any) -> dict[str, Any]:
-    learned = {} if guide == "none" else {"guide_options": LEARNED}
+    learned = {"guide_options": LEARNED.get(guide, {})}
     return render(_scene(), guide=guide, **({"uniform_fraction": 0.25} | learned | options))
 
 
@@ -87,6 +88,29 @@ def test_a_timed_render_is_replayed(guide: str) -> None:
 def test_spp_is_replayed(guide: str) -> None:
     asked = _render(guide, spp=20, keep_pilot=False)
     _assert_equal(asked, _render(guide, replay=asked["record"]["passes"], keep_pilot=False))
+
+
+@pytest.mark.parametrize("guide", ["table", "mixture-net", "auto"])
+def test_guides_refined_from_pass_to_pass_are_replayed(guide: str) -> None:
+    """Each pass was drawn by what the passes before it taught, and `auto` may have chosen anew: all comes back."""
+    asked = _render(guide, spp=96, threads=2, combine="variance")
+    passes = asked["record"]["passes"]
+    assert sum(p["fit"] for p in passes) > 1, passes
+    _assert_equal(asked, _render(guide, replay=passes, threads=3, combine="variance"))
+
+
+@pytest.mark.parametrize("k", range(1, 7))
+def test_auto_renders_any_number_of_bounces_and_says_why(k: int) -> None:
+    mi.set_variant(LLVM)
+    core, _ = core_scene(mi.load_dict(SCENES["furnace_sphere"]()))
+    result = render(core, guide="auto", k=k, spp=16)
+    assert np.isfinite(result["image"]).all()
+    assert result["image"].any()
+    record = result["record"]
+    candidates = record["candidates"]
+    assert [c["name"] for c in candidates if c["chosen"]] == [record["chosen"]]
+    assert {"none"} < {c["name"] for c in candidates}
+    assert all(c["why"] for c in candidates)
 
 
 def test_variance_is_that_of_the_mean() -> None:

@@ -10,7 +10,7 @@ import pytest
 
 import pssflow
 from pssflow.cli import main
-from pssflow.inspect import DISK, GRID, at_pixel, over_image
+from pssflow.inspect import DISK, GRID, _Disk, at_pixel, over_image
 
 ROOT = Path(__file__).parents[2]
 CORNELL = ROOT / "scenes" / "cornell-box" / "scene.xml"
@@ -39,6 +39,58 @@ def test_densities_of_a_pixel_are_densities(scene):
         assert guide.density.min() >= guide.a - 1e-6
 
 
+@pytest.mark.parametrize(("lowest", "reach"), [(0.0, 1.0), (-1.0, np.sqrt(2))])
+def test_a_disk_holds_all_directions_at_their_density(lowest, reach):
+    """Uniform on the hemisphere or on the sphere: the rim's cells, too, have the density 1/2π or 1/4π."""
+    rng = np.random.default_rng(1)
+    cosine, angle = rng.uniform(lowest, 1, 1_000_000), rng.uniform(0, 2 * np.pi, 1_000_000)
+    sine = np.sqrt(1 - cosine**2)
+    along = np.stack([sine * np.cos(angle), cosine, sine * np.sin(angle)], axis=1)
+    normal = np.array([0, 1, 0], np.float32)
+    disk = _Disk(along.astype(np.float32), np.ones(len(along), bool), normal)
+    assert disk.reach == pytest.approx(reach)
+    density = disk.density(np.ones(len(along)))
+    inside = np.isfinite(density)
+    # Slivers of the rim that none of a cell's points fell on are left out.
+    assert np.sum(density[inside] * disk.steradians[inside]) == pytest.approx(1, rel=1e-4)
+    uniform = 1 / (2 * np.pi * (1 - lowest))
+    # 300 directions a whole cell; of a sliver of one, few.
+    whole = disk.steradians > 0.5 * disk.steradians.max()
+    assert np.abs(density[whole] / uniform - 1).max() < 0.5
+    assert density[whole].mean() == pytest.approx(uniform, rel=0.01)
+
+
+def test_below_a_surface_that_lets_light_through_the_sphere_is_shown():
+    mi.set_variant("scalar_rgb")
+    room = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": {
+                "type": "perspective",
+                "to_world": mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0]),
+                "film": {"type": "hdrfilm", "width": 4, "height": 4},
+            },
+            "sheet": {
+                "type": "rectangle",
+                "bsdf": {"type": "roughdielectric", "alpha": 0.3},
+            },
+            "room": {"type": "sphere", "radius": 5.0, "flip_normals": True},
+            "lamp": {"type": "point", "position": [0, 2, -2]},
+        }
+    )
+    found = at_pixel(pssflow.Scene(room), (2, 2), ("none",), spp=4)
+    assert found.reach == pytest.approx(np.sqrt(2))
+    steps = np.linspace(-found.reach, found.reach, DISK)
+    below = np.hypot(steps[:, None], steps[None, :]) > 1.1
+    assert np.nansum(found.f_directions[below]) > 0
+    assert np.nansum(found.f_directions[~below]) > 0
+
+
+def test_one_bounce_has_a_map_but_no_direction(scene):
+    found = over_image(scene, ("auto",), spp=8, k=1)
+    assert found.rows[0].nonzero_share.shape == (scene.height, scene.width)
+
+
 def test_maps_have_the_film_s_shape_and_shares_are_shares(scene):
     found = over_image(scene, ("direction-table", "vegas"), spp=16)
     shape = (scene.height, scene.width)
@@ -53,7 +105,7 @@ def test_maps_have_the_film_s_shape_and_shares_are_shares(scene):
     assert found.nonzero_share.max() <= 1
 
 
-@pytest.mark.parametrize("look", [("--pixel", "8,12"), ("--map",)])
+@pytest.mark.parametrize("look", [("--pixel", "8,12"), ("--map",), ("--map", "--k", "1")])
 def test_the_command_writes_a_picture(look, tmp_path, capfd):
     out = tmp_path / "out.png"
     code = main(["inspect", str(CORNELL), *TINY, *look, "-o", str(out), "--spp", "8", "-q"])

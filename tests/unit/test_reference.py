@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +13,7 @@ import numpy as np
 import pytest
 
 import pssflow
+from pssflow import _core
 from pssflow import reference as module
 from pssflow.reference import Reference, default_cache, read_exr, reference
 from tests import scenes
@@ -172,6 +176,45 @@ def test_an_exr_goes_around(llvm_variant, tmp_path):
     np.testing.assert_array_equal(grey.image, np.repeat(pixels, 3, axis=2))
     assert not grey.variance.any()
     assert grey.describe()["standard_error"] is None
+
+
+ONE_CORE = """
+import os, sys
+os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+import mitsuba as mi
+mi.set_variant("scalar_rgb")
+import numpy as np
+from pssflow import _core
+from pssflow.reference import read_exr
+image = np.arange(60, dtype=np.float32).reshape(4, 5, 3)
+_core.write_exr(sys.argv[1], {"": image, "variance": image + 1})
+read = read_exr(sys.argv[1])
+assert np.array_equal(read.image, image) and np.array_equal(read.variance, image + 1)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores cannot be taken away here")
+def test_an_exr_is_read_where_one_core_is_usable(tmp_path):
+    """Mitsuba's own reader never returns there."""
+    command = [sys.executable, "-c", ONE_CORE, str(tmp_path / "truth.exr")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_layers_of_an_exr_of_ours_are_mitsubas(llvm_variant, tmp_path):
+    """Channel by channel; what ours does not know, as a grey image, is left to Mitsuba."""
+    rng = np.random.default_rng(1)
+    image, variance = rng.random((2, 5, 7, 3), np.float32)
+    path = tmp_path / "image.exr"
+    Reference(image, variance, 1, 1, 0.0, "").write(path)
+    read = _core.read_exr(str(path))
+    assert sorted(read) == sorted([*"RGB", *(f"variance.{c}" for c in "RGB")])
+    for name, layer in mi.Bitmap(str(path)).split():
+        prefix = "" if name == "<root>" else f"{name}."
+        for i, c in enumerate("RGB"):
+            np.testing.assert_array_equal(read[prefix + c], np.array(layer)[:, :, i])
+    with pytest.raises(ValueError, match=r"cannot read .*none\.exr"):
+        _core.read_exr(str(tmp_path / "none.exr"))
 
 
 def test_bad_files(llvm_variant, tmp_path):

@@ -107,7 +107,15 @@ impl Guide for Composite {
 
     fn describe(&self) -> serde_json::Value {
         let factors: Vec<_> = self.factors.iter().map(|f| f.describe()).collect();
-        json!({ "name": self.name, "factors": factors })
+        let memory: u64 = factors.iter().filter_map(|f| f["memory"].as_u64()).sum();
+        json!({
+            "name": self.name,
+            "models": self.models,
+            "dims": self.dims,
+            "parameters": self.parameters(),
+            "memory": memory,
+            "factors": factors,
+        })
     }
 
     fn contents(&self) -> Option<Contents> {

@@ -13,6 +13,15 @@ pub const ALIASES: [(&str, &str); 1] = [("table", "direction-table+emitter-table
 /// Share of uniform paths that a factor assumes in the mixture when it looks past the factors before it.
 const DEFENSIVE: f32 = 0.1;
 
+/// Bytes that the factors of a composite share: as many as a table alone may take by default.
+const SHARED: u64 = 256 << 20;
+
+/// What of [`SHARED`] is kept for each factor that is still to be fitted.
+const RESERVED: u64 = SHARED / 8;
+
+/// Option of guides that bound their memory, in MiB.
+const MEMORY: &str = "memory_mib";
+
 /// One guide, or a product of guides that model different decisions.
 #[derive(Clone, Debug)]
 pub struct Recipe {
@@ -22,7 +31,8 @@ pub struct Recipe {
 
 impl Recipe {
     /// Understands `name`, a registry line, several joined by `+`, or one of [`ALIASES`], and checks the options:
-    /// those of the guide itself, or for a composite one object a factor, by the factor's name.
+    /// those of the guide itself, or for a composite one object a factor, by the factor's name. Factors that are not
+    /// told `memory_mib` share 256 MiB.
     ///
     /// # Errors
     /// [`GuideError::UnknownGuide`], [`GuideError::UnknownOption`], [`GuideError::Option`], and
@@ -153,10 +163,21 @@ impl Recipe {
     ) -> Result<Vec<Fit>, GuideError> {
         let (mut g, mut fitted) = (records.g.to_vec(), Vec::<Fit>::new());
         let mut q = vec![1.0f32; records.f.len()];
+        let mut left = SHARED;
         for (i, (spec, options)) in self.factors.iter().enumerate() {
             let seen = Records { g: &g, ..*records };
             let share = |done: f32| (i as f32 + done) / self.factors.len() as f32;
-            let fit = (spec.fit)(options, &seen, seed, &mut |done| progress(share(done)))?;
+            let (mut options, told) = (options.clone(), options.contains_key(MEMORY));
+            if bounded(spec) && !told {
+                let later = self.factors[i + 1..].iter().filter(|f| bounded(f.0));
+                let most = left.saturating_sub(RESERVED * later.count() as u64);
+                options.insert(MEMORY.to_owned(), (most >> 20).into());
+            }
+            let fit = (spec.fit)(&options, &seen, seed, &mut |done| progress(share(done)))?;
+            if !told {
+                let used = fit.guide.describe()["memory"].as_u64();
+                left = left.saturating_sub(used.unwrap_or(0));
+            }
             if i + 1 < self.factors.len() {
                 records.multiply_densities(&*fit.guide, &mut q);
                 for ((g, &drawn), &q) in g.iter_mut().zip(records.g).zip(&q) {
@@ -208,6 +229,11 @@ impl Recipe {
             format!("{} ({})", self.name, set.join(", "))
         }
     }
+}
+
+/// Whether a guide bounds its memory by an option.
+fn bounded(spec: &GuideSpec) -> bool {
+    (spec.defaults)().contains_key(MEMORY)
 }
 
 /// A guide over the whole path models every other decision, too.

@@ -50,8 +50,9 @@ pub(crate) fn render(e: RenderError) -> PyErr {
         RenderError::Cancelled => PyKeyboardInterrupt::new_err(e.to_string()),
         RenderError::Threads { .. } => PyRuntimeError::new_err(e.to_string()),
         RenderError::Write { .. } => PyOSError::new_err(e.to_string()),
-        RenderError::Trace(_) | RenderError::Option { .. } | RenderError::Dimensions { .. } => {
-            PyValueError::new_err(e.to_string())
-        }
+        RenderError::Trace(_)
+        | RenderError::Option { .. }
+        | RenderError::Dimensions { .. }
+        | RenderError::Read { .. } => PyValueError::new_err(e.to_string()),
     }
 }

@@ -26,7 +26,7 @@ mod _core {
     #[pymodule_export]
     use super::guide::{Guide, guide_aliases, guides};
     #[pymodule_export]
-    use super::output::write_exr;
+    use super::output::{read_exr, write_exr};
     #[pymodule_export]
     use super::scene::Scene;
 

@@ -5,8 +5,22 @@ use std::path::PathBuf;
 
 use numpy::{PyReadonlyArray3, PyUntypedArrayMethods};
 use pyo3::prelude::*;
+use pyo3::types::PyDict;
 
-use crate::errors;
+use crate::{arrays, errors};
+
+/// Channels (h, w) of an OpenEXR image by their full names.
+#[pyfunction]
+pub(crate) fn read_exr(py: Python<'_>, path: PathBuf) -> PyResult<Bound<'_, PyDict>> {
+    let read = py
+        .detach(|| pssflow::output::read_exr(&path))
+        .map_err(errors::render)?;
+    let dict = PyDict::new(py);
+    for (name, values) in read.values {
+        dict.set_item(name, arrays::to_matrix(py, values, read.width)?)?;
+    }
+    Ok(dict)
+}
 
 /// Writes layers of (h, w, 3) values as OpenEXR.
 #[pyfunction]

@@ -47,6 +47,14 @@ pub enum RenderError {
         /// Why not.
         reason: String,
     },
+    /// A file that cannot be read.
+    #[error("cannot read {path:?}: {reason}")]
+    Read {
+        /// The file.
+        path: std::path::PathBuf,
+        /// The system's or the format's reason.
+        reason: String,
+    },
     /// A file that cannot be written.
     #[error("cannot write {path:?}: {reason}")]
     Write {

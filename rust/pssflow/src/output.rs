@@ -5,7 +5,9 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use exr::prelude::{AnyChannel, AnyChannels, FlatSamples, Image, WritableImage};
+use exr::prelude::{
+    AnyChannel, AnyChannels, FlatSamples, Image, ReadChannels, ReadLayers, WritableImage,
+};
 
 use crate::error::RenderError;
 
@@ -54,6 +56,53 @@ pub fn write_exr(
     })
 }
 
+/// Channels of an image by their full names (`R`, `variance.R`), each of `width` × `height` values.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Channels {
+    /// Columns.
+    pub width: usize,
+    /// Names and values, row by row from the top.
+    pub values: Vec<(String, Vec<f32>)>,
+}
+
+/// Reads the first part of an EXR, on the calling thread alone.
+///
+/// # Errors
+/// [`RenderError::Read`], naming the file: it is none, is damaged, or has channels of several sizes.
+pub fn read_exr(path: &Path) -> Result<Channels, RenderError> {
+    let error = |reason: String| RenderError::Read {
+        path: path.to_owned(),
+        reason,
+    };
+    let image = exr::prelude::read()
+        .no_deep_data()
+        .largest_resolution_level()
+        .all_channels()
+        .first_valid_layer()
+        .all_attributes()
+        .non_parallel()
+        .from_file(path)
+        .map_err(|e| error(e.to_string()))?;
+    let layer = image.layer_data;
+    let pixels = layer.size.area();
+    let mut values = Vec::new();
+    for channel in layer.channel_data.list {
+        if channel.sample_data.len() != pixels {
+            return Err(error(format!(
+                "channel {} has {} values for {pixels} pixels",
+                channel.name,
+                channel.sample_data.len()
+            )));
+        }
+        let samples = channel.sample_data.values_as_f32().collect();
+        values.push((channel.name.to_string(), samples));
+    }
+    Ok(Channels {
+        width: layer.size.width(),
+        values,
+    })
+}
+
 /// Lets `write` fill a file next to `path`, then renames it; removes it where that fails.
 ///
 /// # Errors
@@ -97,14 +146,33 @@ mod tests {
         let path = folder.path().join("image.exr");
         let values: Vec<f32> = (0..24).map(|i| i as f32).collect();
         write_exr(&path, 4, 2, &[("", &values), ("variance", &values)]).unwrap();
-        let image = exr::prelude::read_all_flat_layers_from_file(&path).unwrap();
-        let names: Vec<String> = image
-            .layer_data
-            .iter()
-            .flat_map(|l| l.channel_data.list.iter().map(|c| c.name.to_string()))
-            .collect();
-        assert!(names.contains(&"G".to_owned()), "{names:?}");
+        let read = read_exr(&path).unwrap();
+        assert_eq!(read.width, 4);
+        for prefix in ["", "variance."] {
+            for (i, channel) in ["R", "G", "B"].into_iter().enumerate() {
+                let name = format!("{prefix}{channel}");
+                let (_, found) = read.values.iter().find(|(n, _)| *n == name).unwrap();
+                let want = values.iter().skip(i).step_by(3);
+                assert!(found.iter().eq(want), "{name}");
+            }
+        }
         assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn what_is_no_exr_is_refused_by_name() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("image.exr");
+        write_exr(&path, 4, 2, &[("", &[0.5; 24])]).unwrap();
+        let whole = fs::read(&path).unwrap();
+        for bytes in [&b"text"[..], &[], &whole[..whole.len() - 9]] {
+            fs::write(&path, bytes).unwrap();
+            let error = read_exr(&path).unwrap_err().to_string();
+            assert!(
+                error.contains("image.exr") && !error.contains('\n'),
+                "{error}"
+            );
+        }
     }
 
     #[test]

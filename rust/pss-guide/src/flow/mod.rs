@@ -422,6 +422,7 @@ impl Guide for RealNvp {
             "models": self.models(),
             "dims": self.dims(),
             "parameters": self.parameters(),
+            "memory": 8 * self.parameters(),
             "mass_outside": self.mass_outside(),
             "options": json_options::to_map(&self.options),
         })

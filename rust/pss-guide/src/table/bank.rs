@@ -51,8 +51,17 @@ pub(super) struct Squares {
     entries: Vec<u16>,
 }
 
+impl Squares {
+    /// Gives back what the entries have room for beyond their number.
+    fn new(bins: usize, mut entries: Vec<u16>) -> Self {
+        entries.shrink_to_fit();
+        Self { bins, entries }
+    }
+}
+
 impl<T> Bank<T> {
-    fn new(grid: Grid, oriented: bool, keys: Vec<u64>, fewest_rows: usize, tables: T) -> Self {
+    fn new(grid: Grid, oriented: bool, mut keys: Vec<u64>, fewest_rows: usize, tables: T) -> Self {
+        keys.shrink_to_fit();
         Self {
             map: CellMap::new(&keys),
             grid,
@@ -75,6 +84,11 @@ impl<T> Bank<T> {
     /// Cells, what the finest grid has per axis, and rows that a cell needed.
     pub(super) fn facts(&self) -> (usize, usize, usize) {
         (self.keys.len(), 1 << self.grid.depth, self.fewest_rows)
+    }
+
+    /// Bytes of the keys and of the map from them.
+    fn places(&self) -> usize {
+        self.map.bytes() + self.keys.len() * size_of::<u64>()
     }
 
     fn fit_with<L: tree::Leaves<Tables = T>>(
@@ -166,10 +180,7 @@ impl Bank<Squares> {
         progress: &mut dyn FnMut(f32) -> bool,
     ) -> Option<Self> {
         let bank = Bank::fit_with(&leaves, plan, examples, progress)?;
-        let tables = Squares {
-            bins: leaves.bins,
-            entries: bank.tables,
-        };
+        let tables = Squares::new(leaves.bins, bank.tables);
         Some(Self::new(
             bank.grid,
             bank.oriented,
@@ -219,7 +230,7 @@ impl Bank<Squares> {
     }
 
     pub(super) fn bytes(&self) -> usize {
-        self.map.bytes() + self.entries() * size_of::<u16>()
+        self.places() + self.entries() * size_of::<u16>()
     }
 
     pub(super) fn put(&self, prefix: &str, contents: &mut Contents) {
@@ -256,7 +267,7 @@ impl Bank<Squares> {
                 "tensor {prefix}tables holds an interval that is empty"
             ));
         }
-        let tables = Squares { bins, entries };
+        let tables = Squares::new(bins, entries);
         let bank = Bank::restore_with(prefix, contents, tables)?;
         if bank.keys.len() * size != bank.tables.entries.len() {
             return Err(format!(
@@ -274,7 +285,9 @@ impl Bank<Lines> {
         examples: &[Example],
         progress: &mut dyn FnMut(f32) -> bool,
     ) -> Option<Self> {
-        Bank::fit_with(leaves, plan, examples, progress)
+        let mut bank = Bank::fit_with(leaves, plan, examples, progress)?;
+        bank.tables.shrink_to_fit();
+        Some(bank)
     }
 
     pub(super) fn entries(&self) -> usize {
@@ -283,7 +296,7 @@ impl Bank<Lines> {
 
     pub(super) fn bytes(&self) -> usize {
         let entry = size_of::<u16>() + size_of::<f32>();
-        self.map.bytes() + self.entries() * entry + self.tables.starts.len() * size_of::<u32>()
+        self.places() + self.entries() * entry + self.tables.starts.len() * size_of::<u32>()
     }
 
     pub(super) fn put(&self, prefix: &str, contents: &mut Contents) {
@@ -306,11 +319,12 @@ impl Bank<Lines> {
         let ends = take(&mut contents.tensors, prefix, "ends")?;
         let guided = take(&mut contents.words, prefix, "guided")?;
         let starts = take(&mut contents.words, prefix, "starts")?;
-        let lines = Lines {
+        let mut lines = Lines {
             starts,
             ends,
             guided: guided.iter().map(|&g| g as u16).collect(),
         };
+        lines.shrink_to_fit();
         if !lines.is_sound() {
             return Err(format!(
                 "tensors {prefix}ends and {prefix}guided are no intervals"

@@ -168,8 +168,8 @@ pub(super) struct CellMap {
 const EMPTY: u64 = u64::MAX;
 
 impl CellMap {
-    /// Bytes per key, at most.
-    pub(super) const BYTES: usize = 4 * size_of::<(u64, u32)>();
+    /// Bytes per key, at most: its own, and up to three slots.
+    pub(super) const BYTES: usize = size_of::<u64>() + 3 * size_of::<(u64, u32)>();
 
     /// Table i belongs to `keys[i]`.
     pub(super) fn new(keys: &[u64]) -> Self {

@@ -166,6 +166,13 @@ impl Leaves for Line {
 }
 
 impl Lines {
+    /// Gives back what the lists have room for beyond their lengths.
+    pub(super) fn shrink_to_fit(&mut self) {
+        self.starts.shrink_to_fit();
+        self.ends.shrink_to_fit();
+        self.guided.shrink_to_fit();
+    }
+
     /// Whether every table consists of intervals that are not empty.
     pub(super) fn is_sound(&self) -> bool {
         let ordered = self.starts.first().is_none_or(|&s| s == 0)

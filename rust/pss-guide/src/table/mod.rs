@@ -164,10 +164,16 @@ impl TableGuide {
                     let mut own = examples(&pair(square));
                     own.retain(|e| around(e) == environment);
                     let used: usize = banks.iter().map(Bank::<Squares>::bytes).sum();
+                    // However many lamps there are, a sky finds room.
+                    let memory = if surrounds.contains(&true) && !environment {
+                        plan.memory / 2
+                    } else {
+                        plan.memory.saturating_sub(used)
+                    };
                     let plan = Plan {
                         oriented: environment,
                         pooled: false,
-                        memory: plan.memory.saturating_sub(used),
+                        memory,
                         ..plan
                     };
                     let mut half = |done: f32| rest(0.5 * (i as f32 + done));

@@ -42,6 +42,18 @@ pub(crate) fn two_paths() -> Records<'static> {
     }
 }
 
+/// Records of paths of the density `g`, f being their largest component as well.
+pub(crate) fn records<'a>(dims: usize, u: &'a [f32], f: &'a [f32], g: &'a [f32]) -> Records<'a> {
+    Records {
+        dims,
+        u,
+        f,
+        f_max: f,
+        g,
+        ..Records::default()
+    }
+}
+
 /// A contribution with a known integral: Π over the columns of 30 u² (1 − u)² where the first column is
 /// below 3/4, and 0 beyond, as if something stood in the way there.
 #[derive(Clone, Copy)]
@@ -115,14 +127,8 @@ pub(crate) fn fit_with(
     let g = vec![1.0; n];
     let pixels = uniform(n, 2, 200);
     let records = Records {
-        dims,
-        u: &u,
-        f: &f,
-        f_max: &f,
-        g: &g,
         pixel: pixels.as_chunks().0,
-        zeros: 0,
-        ..Records::default()
+        ..records(dims, &u, &f, &g)
     };
     fit(name, &options, &records, seed, &mut |_| true).unwrap()
 }

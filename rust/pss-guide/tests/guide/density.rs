@@ -1,6 +1,6 @@
 //! Densities and samples after training.
 
-use pss_guide::{Decision, GuideSpec, Records, fit, registry};
+use pss_guide::{Decision, GuideSpec, fit, registry};
 use pss_rng::{Purpose, Stream};
 
 use crate::common::{self, Target, cases, fit_small, fit_with, moons, options};
@@ -213,15 +213,7 @@ fn two_moons_are_learned() {
         "the claim would say little"
     );
     let one = vec![1.0; 8192];
-    let records = Records {
-        dims: 2,
-        u: &train,
-        f: &one,
-        f_max: &one,
-        g: &one,
-        zeros: 0,
-        ..Records::default()
-    };
+    let records = common::records(2, &train, &one, &one);
     for spec in flows() {
         let guide = fit(
             spec.name,
@@ -248,15 +240,7 @@ fn the_hypercube_prior_fails_as_the_thesis_found() {
     let target = Target { dims: 2 };
     let (u, f) = target.paths(4096, 1);
     let g = vec![1.0; 4096];
-    let records = Records {
-        dims: 2,
-        u: &u,
-        f: &f,
-        f_max: &f,
-        g: &g,
-        zeros: 0,
-        ..Records::default()
-    };
+    let records = common::records(2, &u, &f, &g);
     let fitted = fit(
         "realnvp",
         &options(&[("prior", "hypercube".into())]),

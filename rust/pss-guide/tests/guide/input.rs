@@ -57,13 +57,8 @@ fn bad_paths_are_dropped_counted_or_refused() {
         u[20] = f32::NAN;
         let g = vec![1.0; 2000];
         let records = Records {
-            dims: 2,
-            u: &u,
-            f: &f,
-            f_max: &f,
-            g: &g,
             zeros: 9,
-            ..Records::default()
+            ..common::records(2, &u, &f, &g)
         };
         let fitted = fit(
             spec.name,
@@ -112,15 +107,7 @@ fn a_fit_can_be_cancelled_and_reports_its_progress() {
         let target = Target { dims: 2 };
         let (u, f) = target.paths(2000, 1);
         let g = vec![1.0; 2000];
-        let records = Records {
-            dims: 2,
-            u: &u,
-            f: &f,
-            f_max: &f,
-            g: &g,
-            zeros: 0,
-            ..Records::default()
-        };
+        let records = common::records(2, &u, &f, &g);
         let mut seen = Vec::new();
         let mut cancel = |share| {
             seen.push(share);
@@ -151,15 +138,7 @@ fn a_diverging_fit_says_where_and_what_to_do() {
     let target = Target { dims: 2 };
     let (u, f) = target.paths(4000, 1);
     let g = vec![1.0; 4000];
-    let records = Records {
-        dims: 2,
-        u: &u,
-        f: &f,
-        f_max: &f,
-        g: &g,
-        zeros: 0,
-        ..Records::default()
-    };
+    let records = common::records(2, &u, &f, &g);
     let given = options(&[
         ("learning_rate", 1.0.into()),
         ("s_max", 16.0.into()),

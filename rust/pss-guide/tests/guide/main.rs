@@ -5,6 +5,7 @@ mod common;
 mod density;
 mod files;
 mod input;
+mod memory;
 mod pixel;
 mod places;
 mod select;

@@ -30,13 +30,8 @@ fn fitted(name: &str, condition: &str) -> Fit {
     let f: Vec<f32> = rows.map(|(u, pixel)| f(u, pixel)).collect();
     let g = vec![1.0; n];
     let records = Records {
-        dims: 2,
-        u: &u,
-        f: &f,
-        f_max: &f,
-        g: &g,
         pixel: pixels,
-        ..Records::default()
+        ..common::records(2, &u, &f, &g)
     };
     let given: Map<String, Value> = options(&[("condition", condition.into())]);
     fit(name, &given, &records, 1, &mut |_| true).unwrap()
