@@ -34,7 +34,7 @@ const MOST_FIXED_TRAINING: f64 = 0.025;
 
 /// Light-carrying paths that are looked at, at most: more would tell little, and the choice must not cost more than it
 /// brings.
-const MOST_ROWS: usize = 1 << 17;
+const MOST_ROWS: usize = 1 << 16;
 
 /// Of `HOLD_OUT` paths, one is held out.
 const HOLD_OUT: u64 = 4;

@@ -210,6 +210,10 @@ impl Run<'_> {
         } else {
             0.0
         };
+        let (older, most_kept) = (self.records.len(), self.most_kept());
+        if record > 0.0 {
+            self.reserve_records();
+        }
         let pass = Pass {
             phase: if pilot { Phase::Pilot } else { Phase::Render },
             first_sample: self.next_sample,
@@ -227,23 +231,22 @@ impl Run<'_> {
         } else {
             &mut self.image
         };
-        let mut result = self.context.render(&pass, image)?;
+        let statistics = self.context.render(&pass, image, &mut self.records)?;
         self.apart.extend(own.filter(|_| !discarded));
         if record > 0.0 {
-            result.records.count(result.statistics.counts.camera_rays);
-            result.records.thin(self.most_kept());
-            let rest = self.options.max_records - result.records.len();
-            self.records.thin(rest);
-            self.records.append(&mut result.records);
+            self.records.count(statistics.counts.camera_rays);
+            let newer = (self.records.len() - older).min(most_kept);
+            let rest = self.options.max_records - newer;
+            self.records.thin(older, [rest, newer]);
         }
-        self.lit = result.statistics.counts.lit_share();
+        self.lit = statistics.counts.lit_share();
         self.next_sample += spp;
         let seconds = start.elapsed().as_secs_f64();
         if pilot {
-            self.pilot.add(&result.statistics);
+            self.pilot.add(&statistics);
             self.seconds.pilot += seconds;
         } else {
-            self.rendered.add(&result.statistics);
+            self.rendered.add(&statistics);
             self.seconds.render += seconds;
         }
         let guided = guide.is_some();

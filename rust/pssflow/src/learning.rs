@@ -16,6 +16,9 @@ use crate::progress::Phase;
 const RELEARNING_TIME: f64 = 0.1;
 const RECONSIDERING_TIME: f64 = 0.02;
 
+/// Core-seconds that learning a `table` takes longer for each record more.
+const SECONDS_PER_RECORD: f64 = 1e-6;
+
 /// Share of a training from which on its end can be foretold.
 const ENOUGH_TO_TELL: f64 = 0.2;
 
@@ -71,12 +74,14 @@ impl Run<'_> {
         }
         if let Budget::Time(time) = self.options.budget {
             let remaining = time - self.clock.elapsed().as_secs_f64();
-            let growth = self.records.len() as f64 / (self.current.records as f64).max(1.0);
+            let more = self.records.len().saturating_sub(self.current.records) as f64;
+            let threads = self.context.pool.current_num_threads() as f64;
+            let seconds = self.current.seconds + more * SECONDS_PER_RECORD / threads;
             let share = match self.current.guide {
                 Some(_) => RELEARNING_TIME,
                 None => RECONSIDERING_TIME,
             };
-            if self.current.seconds * growth.max(1.0) > share * remaining {
+            if seconds > share * remaining {
                 self.current.settled = true;
                 return Ok(());
             }

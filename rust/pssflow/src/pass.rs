@@ -89,29 +89,23 @@ pub(crate) struct Pass<'a> {
     pub(crate) span: (f32, f32),
 }
 
-/// What a pass adds up to.
-pub(crate) struct PassResult {
-    pub(crate) statistics: Statistics,
-    pub(crate) records: PathRecords,
-}
-
+/// What a part of a pass adds up to.
 struct Piece {
     sums: Accumulator,
-    result: PassResult,
+    statistics: Statistics,
+    records: PathRecords,
 }
 
 impl PassContext<'_> {
-    /// Renders `pass` and adds it to `image`.
+    /// Renders `pass`, adds it to `image`, and its paths that are kept to `records`.
     pub(crate) fn render(
         &self,
         pass: &Pass<'_>,
         image: &mut Accumulator,
-    ) -> Result<PassResult, RenderError> {
+        records: &mut PathRecords,
+    ) -> Result<Statistics, RenderError> {
         let pieces = self.pieces(pass);
-        let mut total = PassResult {
-            statistics: Statistics::default(),
-            records: PathRecords::default(),
-        };
+        let mut total = Statistics::default();
         let (start, end) = pass.span;
         for (batch, work) in pieces.chunks(BATCH).enumerate() {
             let done: Vec<Option<Piece>> = self.pool.install(|| {
@@ -126,8 +120,8 @@ impl PassContext<'_> {
                     return Err(RenderError::Cancelled);
                 };
                 image.merge_weighted(&piece.sums, |_, _| pass.weight);
-                total.statistics.add(&piece.result.statistics);
-                total.records.append(&mut piece.result.records);
+                total.add(&piece.statistics);
+                records.append(&mut piece.records);
             }
             let share = ((batch * BATCH + work.len()) as f32) / pieces.len() as f32;
             self.progress
@@ -165,10 +159,8 @@ impl PassContext<'_> {
         let stream = Stream::new(self.seed, Purpose::Path);
         let mut piece = Piece {
             sums: Accumulator::new(film, tile),
-            result: PassResult {
-                statistics: Statistics::default(),
-                records: PathRecords::default(),
-            },
+            statistics: Statistics::default(),
+            records: PathRecords::default(),
         };
         let mut paths = Paths::new(columns);
         paths.record = pass.contexts && pass.record > 0.0;
@@ -229,7 +221,7 @@ impl PassContext<'_> {
     ) {
         let film = self.tracer.scene().film();
         let columns = self.tracer.columns();
-        let statistics = &mut piece.result.statistics;
+        let statistics = &mut piece.statistics;
         let counts = &mut statistics.counts;
         counts.camera_rays += paths.len() as u64;
         counts.paths_found += paths.found.iter().filter(|&&f| f).count() as u64;
@@ -257,7 +249,7 @@ impl PassContext<'_> {
             );
             if !estimate.is_finite() {
                 // Counts as a path without light, here as in the tracer.
-                piece.result.statistics.counts.non_finite += 1;
+                piece.statistics.counts.non_finite += 1;
                 (f, estimate) = (Rgb::ZERO, Rgb::ZERO);
             }
             piece
@@ -266,10 +258,10 @@ impl PassContext<'_> {
             if f == Rgb::ZERO {
                 continue;
             }
-            piece.result.statistics.add_estimate(estimate, weight);
+            piece.statistics.add_estimate(estimate, weight);
             if thin < pass.record {
                 let [x, y] = paths.film[i];
-                piece.result.records.push(
+                piece.records.push(
                     paths,
                     i,
                     columns.width(),

@@ -62,25 +62,54 @@ impl PathRecords {
         }
     }
 
-    /// Keeps `most` paths, evenly from the first to the last; each then stands for as many more.
-    pub(crate) fn thin(&mut self, most: usize) {
+    /// Makes room for so many paths in all. Growing step by step would copy them again and again, into fresh pages.
+    pub(crate) fn reserve(&mut self, paths: usize, width: usize) {
+        let more = paths.saturating_sub(self.len());
+        self.u.reserve_exact(more * width);
+        for numbers in self.numbers() {
+            numbers.reserve_exact(more);
+        }
+        self.contexts.reserve_exact(more * (width / 2));
+        self.pixel.reserve_exact(more);
+    }
+
+    /// Keeps, evenly from first to last, `most[0]` of the first `older` paths and `most[1]` of those behind them; each
+    /// then stands for as many more.
+    pub(crate) fn thin(&mut self, older: usize, most: [usize; 2]) {
         let all = self.len();
-        if all <= most {
+        let parts = [0..older, older..all];
+        let sizes = parts.each_ref().map(|part| part.len() as u64);
+        let kept = [0, 1].map(|i| sizes[i].min(most[i] as u64));
+        if kept == sizes {
             return;
         }
-        let (kept, of) = (most as u64, all as u64);
-        let stays = |row: usize| (row as u64 + 1) * kept / of > row as u64 * kept / of;
-        let share = most as f32 / all as f32;
-        keep(&mut self.u, all, stays);
-        for numbers in [&mut self.f, &mut self.f_bsdf, &mut self.f_max] {
+        let stays = |row: usize| {
+            let i = usize::from(row >= older);
+            let at = (row - parts[i].start) as u64;
+            (at + 1) * kept[i] / sizes[i] > at * kept[i] / sizes[i]
+        };
+        for density in [&mut self.g, &mut self.g_bsdf] {
+            for (part, (kept, size)) in parts.iter().zip(kept.iter().zip(sizes)) {
+                let share = *kept as f32 / size as f32;
+                density[part.clone()].iter_mut().for_each(|g| *g *= share);
+            }
+        }
+        for numbers in self.numbers() {
             keep(numbers, all, stays);
         }
-        for density in [&mut self.g, &mut self.g_bsdf] {
-            keep(density, all, stays);
-            density.iter_mut().for_each(|g| *g *= share);
-        }
+        keep(&mut self.u, all, stays);
         keep(&mut self.contexts, all, stays);
         keep(&mut self.pixel, all, stays);
+    }
+
+    fn numbers(&mut self) -> [&mut Vec<f32>; 5] {
+        [
+            &mut self.f,
+            &mut self.f_bsdf,
+            &mut self.f_max,
+            &mut self.g,
+            &mut self.g_bsdf,
+        ]
     }
 
     pub(crate) fn append(&mut self, other: &mut Self) {
@@ -145,16 +174,17 @@ mod tests {
         };
         let sum = |r: &PathRecords| r.f.iter().zip(&r.g).map(|(f, g)| f / g).sum::<f32>();
         let before = sum(&records);
-        records.thin(2000);
+        records.thin(400, [400, 600]);
         assert_eq!(records.len(), 1000);
-        records.thin(300);
+        records.thin(400, [50, 250]);
         assert_eq!(records.len(), 300);
+        assert!(records.f[49] < 400.0 && records.f[50] >= 400.0);
         for (i, &x) in records.f.iter().enumerate() {
             assert_eq!(records.u[2 * i..2 * i + 2], [x, -x]);
             assert_eq!(records.pixel[i], [x, x]);
         }
-        assert!((sum(&records) / before - 1.0).abs() < 0.01);
-        records.thin(0);
+        assert!((sum(&records) / before - 1.0).abs() < 0.02);
+        records.thin(50, [0, 0]);
         assert!(records.u.is_empty() && records.pixel.is_empty());
     }
 }

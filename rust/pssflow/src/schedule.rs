@@ -18,6 +18,9 @@ const TRAINING_TIME: f64 = 0.3;
 const ENOUGH_TO_START: f64 = 65_536.0;
 const LEAST_PILOT_TIME: f64 = 1.0 / 40.0;
 
+/// Records beyond which room is made as they come.
+const MOST_RESERVED: usize = 4_000_000;
+
 /// How much more light the paths of a pass are taken to carry, at most, than those of the pass before: where the first
 /// guide comes between them, and else.
 const FIRST_GUIDED: f64 = 4.0;
@@ -108,7 +111,7 @@ impl Run<'_> {
             {
                 break;
             }
-            let teaches = refines && !self.current.settled;
+            let mut teaches = refines && !self.current.settled;
             let mut record = 0.0;
             if let Some(each) = each {
                 // What a snapshot cut short does not slow the doubling down.
@@ -117,6 +120,8 @@ impl Run<'_> {
                 } else {
                     2 * largest
                 };
+                // What the rest of the time holds may be too little to learn again.
+                teaches &= (time - now) / each >= f64::from(doubled);
                 spp = doubled
                     .min(self.affordable(each, time))
                     .min(Options::MOST_SPP.saturating_sub(self.next_sample));
@@ -203,6 +208,14 @@ impl Run<'_> {
             left -= spp;
         }
         Ok(())
+    }
+
+    /// Makes room for all records at once, where their number is no wish beyond what memory holds.
+    pub(crate) fn reserve_records(&mut self) {
+        let most =
+            (f64::from(self.options.max_records.min(MOST_RESERVED) as u32) * NEXT_PASS) as usize;
+        let width = self.context.tracer.columns().learned();
+        self.records.reserve(most, width);
     }
 
     /// Share of the light-carrying paths of a pass of `spp` to keep, as many as [`Self::most_kept`] if about as many carry
