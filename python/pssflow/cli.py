@@ -131,7 +131,7 @@ def _render_options(command: F) -> F:
             click.option(
                 "--pilot-spp",
                 type=click.IntRange(1),
-                help="Pilot.  [default: an eighth of --spp; a quarter for flows]",
+                help="Pilot.  [default: a 32nd of --spp; a quarter for flows]",
             ),
             click.option(
                 "--keep-pilot/--discard-pilot",

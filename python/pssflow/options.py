@@ -41,7 +41,7 @@ EMITTER_STRATEGIES = ("mis", "nee", "auto")
 PASS_KINDS = ("pilot", "guided", "uniform")
 
 COMBINATIONS = ("samples", "variance")
-"""How passes become one image: every sample counts the same, or each pass by its variance."""
+"""How passes become one image: every sample the same but for half of a pilot's, or each pass by its variance."""
 
 DEFAULT_GUIDE = "auto"
 """Whatever pays, or none."""

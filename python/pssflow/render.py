@@ -122,11 +122,12 @@ def render(
         approximate: as in `Scene`, which decides it where one is given: replace what is not supported, with a note.
         preset: `thesis`: NEE alone, a pilot of 16 spp that is discarded, a = 0, then 16 spp from the guide; with
             another `spp`, half for the pilot. What is given beside it wins.
-        pilot_spp: samples per pixel of the pilot. Default: an eighth of `spp` or a tenth of `time` for a guide that
-            later passes refine, a quarter or a seventh for one that is trained once.
+        pilot_spp: samples per pixel of the pilot. Default: for a guide that later passes refine a thirty-second of
+            `spp`, or a fortieth to a tenth of `time`, until 65,536 paths carry light; for one that is trained once a
+            quarter or a seventh.
         keep_pilot: whether the pilot's paths enter the image. Default: yes.
-        combine: how passes become one image: `samples` (default; every sample counts the same) or `variance` (each pass
-            by its variance, estimated crosswise from halves of the image: less noise, a bias of the order of 1 ÷ spp).
+        combine: how passes become one image: `samples` (default; every sample the same, but one of the pilot half) or
+            `variance` (each pass by its variance, estimated crosswise from halves of the image: less noise, a bias of the order of 1 ÷ spp).
         replay: the record of an earlier run (`Result.stats` or the command's JSON file), whose guide, settings, seed
             and passes are repeated, or only its `passes`.
         snapshots: shorter times, increasing, at which the image so far is handed out (`Result.snapshots`): the last one

@@ -58,7 +58,7 @@ def _kbounce_runs(scene: Any, *, k: int, seeds: range, spp: int) -> Runs:
     ],
 )
 def test_its_mean_is_the_difference_of_two_depths(name: str, k: int, artifacts: Path) -> None:
-    """H0: equal means; and the same runs with 2 % more light fail, so that this could have failed."""
+    """H0: equal means; and the same runs with 3 % more light fail, so that this could have failed."""
     mi.set_variant(LLVM)
     scene = _load(name)
     truth = truth_runs(scene, k=k, seeds=range(RUNS), spp=SPP[name])

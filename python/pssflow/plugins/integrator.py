@@ -39,8 +39,8 @@ Learned light of exactly k bounces (:monosp:`pssflow`)
    - Share of uniform paths in the mixture, in [0, 1]. (Default: the guide's, 0.25 for flows; bounds weights by 1/0.25)
  * - pilot_spp
    - |int|
-   - Samples per pixel of the pilot. (Default: an eighth of ``spp`` or a tenth of ``time`` for a guide that later passes
-     refine, a quarter or a seventh for one that is trained once)
+   - Samples per pixel of the pilot. (Default: for a guide that later passes refine a thirty-second of ``spp`` or
+     a fortieth to a tenth of ``time``; for one that is trained once a quarter or a seventh)
  * - keep_pilot
    - |bool|
    - Whether the pilot's paths enter the image. (Default: |true|)

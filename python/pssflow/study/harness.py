@@ -217,13 +217,13 @@ class Study:
             try:
                 with clock.run():
                     shots = method.run(case.scene, seed, self.times, self.progress)
+                common = self._common(name, case, method, seed, key)
+                common |= {"load_before": before, "load_after": os.getloadavg()[0]}
+                self._keep_images(name, method, seed, shots)
+                found = {shot.time: measured(shot, truth, common) for shot in shots}
             except FAILURES as error:
                 self._leave_out(failure, error)
                 continue
-            common = self._common(name, case, method, seed, key)
-            common |= {"load_before": before, "load_after": os.getloadavg()[0]}
-            self._keep_images(name, method, seed, shots)
-            found = {shot.time: measured(shot, truth, common) for shot in shots}
             size = truth.image.shape[1], truth.image.shape[0]
             self.store.put(
                 found.get(time) or nothing_yet(time, size, truth, common) for time in self.times

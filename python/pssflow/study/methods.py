@@ -40,11 +40,11 @@ VEGAS = "python-vegas"
 OTHERS = (*MITSUBA, VEGAS)
 """Methods that are no guide of pssflow's own."""
 
-PATHS_PER_PASS = 1 << 18
-"""Of Mitsuba, about: a wavefront that is worth its overhead, and many to a second."""
+PATHS_PER_PASS = (1 << 18, 1 << 20)
+"""Of Mitsuba, about, at first and at most: a wavefront that is worth its overhead, and many to a second."""
 
 SHARE_OF_FIRST = 0.25
-"""Of the shortest time that a pass may take, if its samples can be fewer: what does not fit any more is lost."""
+"""Of the shortest time that a pass takes, as far as its number of paths lets it: what does not fit any more is lost."""
 
 
 @dataclass
@@ -192,7 +192,7 @@ def _passes(
 ) -> list[Shot]:
     """Whole passes, none of which ends after its time; the snapshot at a time is what there was then."""
     pixels = scene.width * scene.height
-    spp = max(PATHS_PER_PASS // pixels, 1) if render.jit else 1
+    spp, most = (max(paths // pixels, 1) if render.jit else 1 for paths in PATHS_PER_PASS)
     # References count from 0, and must not share a number with what they measure.
     first = (seed + 1) << 20
     start = time.perf_counter()
@@ -208,8 +208,9 @@ def _passes(
     if render.jit:
         longest = measure(spp)
         fitting = SHARE_OF_FIRST * times[0] / longest if longest > 0.0 else 1.0
-        if fitting < 1.0 and spp > 1:
-            spp = max(int(spp * fitting), 1)
+        suits = min(max(int(spp * fitting), 1), most)
+        if suits != spp:
+            spp = suits
             longest = measure(spp)
     warm_up = time.perf_counter() - start
     state = Running.empty([scene.width, scene.height], spp)

@@ -65,6 +65,10 @@ impl Densities {
 pub(crate) struct HeldOut<'a> {
     records: Records<'a>,
     side: usize,
+    /// Paths of a tile.
+    each: f64,
+    /// By tile: Ī.
+    means: Vec<f64>,
     /// By tile: 1 ÷ (paths · (Ī² + ε)), 0 for tiles without light.
     scale: Vec<f64>,
     /// Σ over tiles of an unbiased estimate of I² ÷ (Ī² + ε).
@@ -81,11 +85,13 @@ impl<'a> HeldOut<'a> {
         let mut held = Self {
             records,
             side,
+            each: paths / (side * side) as f64,
+            means: Vec::new(),
             scale: vec![0.0; side * side],
             square: 0.0,
             uniform: 0.0,
         };
-        let each = paths / (side * side) as f64;
+        let each = held.each;
         let (mut means, mut squares) = (vec![0.0; side * side], vec![0.0; side * side]);
         for row in held.rows() {
             let share = held.records.terms(row).value() / each;
@@ -105,6 +111,7 @@ impl<'a> HeldOut<'a> {
             *scale = 1.0 / (each * size);
             held.square += pairs * (mean * mean - own) / size;
         }
+        held.means = means;
         let one = vec![1.0; held.records.f.len()];
         let one = Densities {
             all: one.clone(),
@@ -132,7 +139,8 @@ impl<'a> HeldOut<'a> {
         self.uniform / (variance + error).max(least)
     }
 
-    /// V(a), and its standard error.
+    /// V(a), and its standard error: the spread of what each path, also one without light, changes in the sum and in the
+    /// square of its tile's mean.
     fn variance(&self, q: &Densities, a: f32) -> (f64, f64) {
         let a = f64::from(a);
         let mixture = |q: f32| {
@@ -143,15 +151,19 @@ impl<'a> HeldOut<'a> {
             }
         };
         let (mut sum, mut squares) = (0.0, 0.0);
+        let mut changes = vec![0.0; self.scale.len()];
         for row in self.rows() {
             let terms = self.records.terms(row);
             let value = terms.nee_square() / mixture(q.all[row])
                 + terms.bsdf_square() / mixture(q.directions[row]);
-            let share = value * self.scale[self.tile(row)];
-            sum += share;
-            squares += share * share;
+            let tile = self.tile(row);
+            sum += value * self.scale[tile];
+            let change = (value - 2.0 * self.means[tile] * terms.value()) * self.scale[tile];
+            squares += change * change;
+            changes[tile] += change;
         }
-        (sum - self.square, squares.sqrt())
+        let known = changes.iter().map(|c| c * c).sum::<f64>() / self.each;
+        (sum - self.square, (squares - known).max(0.0).sqrt())
     }
 
     fn rows(&self) -> impl Iterator<Item = usize> + use<'a> {

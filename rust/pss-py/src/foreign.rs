@@ -144,7 +144,7 @@ impl Learner for ForeignGuide {
         &self.name
     }
 
-    // Python libraries may keep state by thread.
+    // Python libraries may keep state by thread: all fits of a render are one thread's.
     fn on_callers_thread(&self) -> bool {
         true
     }
@@ -156,6 +156,14 @@ impl Learner for ForeignGuide {
         progress: &mut dyn FnMut(f32) -> bool,
     ) -> Result<Fit, GuideError> {
         let start = std::time::Instant::now();
+        if records.f.len() < 2 {
+            return Err(GuideError::TooFewPaths {
+                usable: records.f.len(),
+                given: records.f.len(),
+                nonfinite: 0,
+                zeros: records.zeros,
+            });
+        }
         progress(0.0);
         let done = Python::attach(|py| {
             let u = arrays::to_matrix(py, records.u.to_vec(), records.dims)?;

@@ -32,7 +32,7 @@ pub trait Learner: Send + Sync {
         DEFAULT_UNIFORM_FRACTION
     }
 
-    /// Whether it must be fitted by the thread that called the render, and not among the render's own threads.
+    /// Whether all its fits must be one thread's, the one that called the render, and not among the render's own.
     fn on_callers_thread(&self) -> bool {
         false
     }

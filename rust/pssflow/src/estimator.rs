@@ -210,7 +210,7 @@ impl Run<'_> {
         } else {
             0.0
         };
-        let (older, most_kept) = (self.records.len(), self.most_kept());
+        let older = self.records.len();
         if record > 0.0 {
             self.reserve_records();
         }
@@ -221,6 +221,7 @@ impl Run<'_> {
             weight: self.options.combine.weight(kind),
             guide: guide.as_deref().map(|g| (g, mixture)),
             record,
+            most_records: self.most_kept(),
             contexts: self.options.guide.looks_at_contexts(),
             span,
         };
@@ -235,8 +236,8 @@ impl Run<'_> {
         self.apart.extend(own.filter(|_| !discarded));
         if record > 0.0 {
             self.records.count(statistics.counts.camera_rays);
-            let newer = (self.records.len() - older).min(most_kept);
-            let rest = self.options.max_records - newer;
+            let newer = self.records.len() - older;
+            let rest = self.options.max_records.saturating_sub(newer);
             self.records.thin(older, [rest, newer]);
         }
         self.lit = statistics.counts.lit_share();

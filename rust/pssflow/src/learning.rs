@@ -19,8 +19,10 @@ const RECONSIDERING_TIME: f64 = 0.02;
 /// Core-seconds that learning a `table` takes longer for each record more.
 const SECONDS_PER_RECORD: f64 = 1e-6;
 
-/// Share of a training from which on its end can be foretold.
+/// Share of a training from which on its end can be foretold, and how many times longer than there is time the rest must
+/// promise to take for it to be given up: shares are no exact times.
 const ENOUGH_TO_TELL: f64 = 0.2;
+const HOPELESS: f64 = 1.5;
 
 /// Where a chooser picked nothing from as many light-carrying paths, more would not change its mind: keeping them and
 /// choosing again only costs.
@@ -53,6 +55,19 @@ pub(crate) struct Current {
     pub(crate) refusal: Option<String>,
 }
 
+impl Current {
+    /// Whether learning anew, from `records` paths now, is worth its time out of what remains. The first time it always is.
+    fn worth_learning(&self, records: usize, threads: usize, remaining: f64) -> bool {
+        let more = records.saturating_sub(self.records) as f64;
+        let seconds = self.seconds + more * SECONDS_PER_RECORD / threads.max(1) as f64;
+        let share = match self.guide {
+            Some(_) => RELEARNING_TIME,
+            None => RECONSIDERING_TIME,
+        };
+        self.learned_from == 0 || seconds <= share * remaining
+    }
+}
+
 impl Run<'_> {
     /// The guide at hand, for a choice that needs no learning.
     pub(crate) fn take_ready(&mut self) -> Result<(), RenderError> {
@@ -74,14 +89,11 @@ impl Run<'_> {
         }
         if let Budget::Time(time) = self.options.budget {
             let remaining = time - self.clock.elapsed().as_secs_f64();
-            let more = self.records.len().saturating_sub(self.current.records) as f64;
-            let threads = self.context.pool.current_num_threads() as f64;
-            let seconds = self.current.seconds + more * SECONDS_PER_RECORD / threads;
-            let share = match self.current.guide {
-                Some(_) => RELEARNING_TIME,
-                None => RECONSIDERING_TIME,
-            };
-            if seconds > share * remaining {
+            let threads = self.context.pool.current_num_threads();
+            if !self
+                .current
+                .worth_learning(self.records.len(), threads, remaining)
+            {
                 self.current.settled = true;
                 return Ok(());
             }
@@ -196,13 +208,9 @@ impl Run<'_> {
         let mut report = |done: f32| {
             progress.update(Phase::Fit, done);
             let now = clock.elapsed().as_secs_f64();
-            // Time spent on a training that cannot end is lost twice.
-            let end = if f64::from(done) < ENOUGH_TO_TELL {
-                now
-            } else {
-                now + start.elapsed().as_secs_f64() * (1.0 / f64::from(done) - 1.0)
-            };
-            late = end > deadline;
+            let rest = start.elapsed().as_secs_f64() * (1.0 / f64::from(done) - 1.0);
+            let hopeless = f64::from(done) >= ENOUGH_TO_TELL && rest > HOPELESS * (deadline - now);
+            late = now > deadline || hopeless;
             !late && !progress.cancelled()
         };
         let dims = self.context.tracer.columns().learned();
@@ -217,7 +225,10 @@ impl Run<'_> {
         self.current.seconds = start.elapsed().as_secs_f64();
         self.seconds.fit += self.current.seconds;
         match done {
-            Ok(done) => Ok(Some(done)),
+            Ok(done) => {
+                self.current.refusal = None;
+                Ok(Some(done))
+            }
             Err(GuideError::Cancelled) if late => {
                 self.current.settled = true;
                 self.current.refusal =
@@ -246,5 +257,21 @@ impl Run<'_> {
             });
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_first_guide_is_learned_however_many_paths_carry_light() {
+        let mut current = Current::default();
+        assert!(current.worth_learning(10_000_000, 1, 0.1));
+        current.learned_from = 1;
+        assert!(!current.worth_learning(10_000_000, 1, 0.1));
+        assert!(current.worth_learning(10_000, 1, 1.0));
+        current.seconds = 0.05;
+        assert!(!current.worth_learning(10_000, 1, 1.0));
     }
 }

@@ -2,7 +2,7 @@
 //!
 //! I ≈ Σ over passes and samples of f(u) ÷ m(u), u ~ m, m = a + (1 − a)·q: random paths first (the pilot),
 //! from which a guide q is learned, then paths from the mixture of the guide and uniform numbers. The pilot
-//! stays in the image, with weights fixed by the sample counts. Start reading at [`render`].
+//! stays in the image, with weights fixed before sampling. Start reading at [`render`].
 //!
 //! This crate joins the tracer (`pss-render`, which knows no guides) and the guides (`pss-guide`, which know
 //! no rays). It knows no Python.

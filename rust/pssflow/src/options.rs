@@ -110,8 +110,8 @@ pub struct Options {
     pub snapshots: Vec<f64>,
     /// Share of uniform paths in the mixture, in [0, 1]; `None`: the guide's own, or what a chooser found best.
     pub uniform_fraction: Option<f32>,
-    /// Samples per pixel of the pilot; `None`: an eighth of `Spp` or a tenth of `Time` for a guide that is refined from
-    /// pass to pass, a quarter or a seventh for one that is trained once.
+    /// Samples per pixel of the pilot; `None`: for a guide that is refined from pass to pass a thirty-second of `Spp`, or of
+    /// `Time` a fortieth to a tenth, until 65,536 paths carry light; a quarter or a seventh for one that is trained once.
     pub pilot_spp: Option<u32>,
     /// Whether the pilot enters the image.
     pub keep_pilot: bool,
@@ -121,7 +121,8 @@ pub struct Options {
     pub seed: u64,
     /// Threads; 0 is one a core.
     pub threads: usize,
-    /// Paths that carry light kept for training, at most; more are thinned at random.
+    /// Paths that carry light kept for training, at most: older ones give way to those of the last pass, which may be
+    /// half of all where more passes are to teach. A replay needs the number of the render that it repeats.
     pub max_records: usize,
 }
 
@@ -173,13 +174,19 @@ impl Options {
                 "between 1 and 16777216 for a guide that learns",
             );
         }
-        if let (GuideChoice::Learn(_), Budget::Spp(spp)) = (&self.guide, &self.budget)
+        let needs_more = match self.guide {
+            GuideChoice::Learn(_) => true,
+            GuideChoice::Auto(_) => !self.keep_pilot,
+            GuideChoice::None | GuideChoice::Ready(_) => false,
+        };
+        if let Budget::Spp(spp) = &self.budget
+            && needs_more
             && *spp <= pilot
         {
             return error(
                 "spp",
                 spp.to_string(),
-                "more than the pilot's, since spp is the total and the guide needs a pass of its own",
+                "more than the pilot's, since spp is the total and the image needs a pass of its own",
             );
         }
         Ok(())

@@ -72,6 +72,7 @@ pub(crate) fn path_numbers(
 }
 
 /// One pass.
+#[derive(Clone, Copy)]
 pub(crate) struct Pass<'a> {
     pub(crate) phase: Phase,
     /// First sample index; samples of different passes must not overlap.
@@ -83,6 +84,8 @@ pub(crate) struct Pass<'a> {
     pub(crate) guide: Option<(&'a dyn Guide, Mixture)>,
     /// Share of the light-carrying paths to record, 0 for none.
     pub(crate) record: f32,
+    /// Most paths to record: where there are more, half of those so far go, and the share is halved.
+    pub(crate) most_records: usize,
     /// Whether their vertices are recorded, too.
     pub(crate) contexts: bool,
     /// Share of the phase that is done before and after this pass, for the progress bar.
@@ -106,12 +109,13 @@ impl PassContext<'_> {
     ) -> Result<Statistics, RenderError> {
         let pieces = self.pieces(pass);
         let mut total = Statistics::default();
+        let (mut pass, older) = (*pass, records.len());
         let (start, end) = pass.span;
         for (batch, work) in pieces.chunks(BATCH).enumerate() {
             let done: Vec<Option<Piece>> = self.pool.install(|| {
                 work.par_iter()
                     .map(|&(tile, first, spp)| {
-                        (!self.progress.cancelled()).then(|| self.piece(pass, tile, first, spp))
+                        (!self.progress.cancelled()).then(|| self.piece(&pass, tile, first, spp))
                     })
                     .collect()
             });
@@ -122,6 +126,10 @@ impl PassContext<'_> {
                 image.merge_weighted(&piece.sums, |_, _| pass.weight);
                 total.add(&piece.statistics);
                 records.append(&mut piece.records);
+            }
+            while records.len() - older > pass.most_records {
+                records.thin(older, [older, (records.len() - older) / 2]);
+                pass.record *= 0.5;
             }
             let share = ((batch * BATCH + work.len()) as f32) / pieces.len() as f32;
             self.progress

@@ -62,15 +62,18 @@ impl PathRecords {
         }
     }
 
-    /// Makes room for so many paths in all. Growing step by step would copy them again and again, into fresh pages.
-    pub(crate) fn reserve(&mut self, paths: usize, width: usize) {
+    /// Makes room for so many paths in all, if there is. Growing step by step would copy them again and again, into fresh
+    /// pages.
+    pub(crate) fn reserve(&mut self, paths: usize, width: usize, contexts: bool) {
         let more = paths.saturating_sub(self.len());
-        self.u.reserve_exact(more * width);
+        let vertices = if contexts { more * (width / 2) } else { 0 };
+        // Where there is none, they find theirs as they come.
+        let _ = self.u.try_reserve_exact(more * width);
         for numbers in self.numbers() {
-            numbers.reserve_exact(more);
+            let _ = numbers.try_reserve_exact(more);
         }
-        self.contexts.reserve_exact(more * (width / 2));
-        self.pixel.reserve_exact(more);
+        let _ = self.contexts.try_reserve_exact(vertices);
+        let _ = self.pixel.try_reserve_exact(more);
     }
 
     /// Keeps, evenly from first to last, `most[0]` of the first `older` paths and `most[1]` of those behind them; each
@@ -167,7 +170,7 @@ mod tests {
             f_bsdf: values().collect(),
             f_max: values().collect(),
             g: vec![1.0; paths.into()],
-            g_bsdf: vec![1.0; paths.into()],
+            g_bsdf: vec![2.0; paths.into()],
             contexts: Vec::new(),
             pixel: values().map(|x| [x, x]).collect(),
             drawn: 4000,
@@ -180,6 +183,7 @@ mod tests {
         assert_eq!(records.len(), 300);
         assert!(records.f[49] < 400.0 && records.f[50] >= 400.0);
         for (i, &x) in records.f.iter().enumerate() {
+            assert_eq!(records.g_bsdf[i], 2.0 * records.g[i]);
             assert_eq!(records.u[2 * i..2 * i + 2], [x, -x]);
             assert_eq!(records.pixel[i], [x, x]);
         }

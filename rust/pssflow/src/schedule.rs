@@ -3,7 +3,7 @@
 use crate::choice::{GuideChoice, Left};
 use crate::error::RenderError;
 use crate::estimator::Run;
-use crate::options::{Options, PassKind, PassPlan};
+use crate::options::{Budget, Options, PassKind, PassPlan};
 
 /// Share of a time budget that the pilot may take, for a guide that is trained once and for one that is refined: later
 /// passes, of whose paths more carry light, teach the latter, too.
@@ -18,8 +18,9 @@ const TRAINING_TIME: f64 = 0.3;
 const ENOUGH_TO_START: f64 = 65_536.0;
 const LEAST_PILOT_TIME: f64 = 1.0 / 40.0;
 
-/// Records beyond which room is made as they come.
+/// Records beyond which room is made as they come, and paths a second beyond which none does.
 const MOST_RESERVED: usize = 4_000_000;
+const MOST_PATHS_PER_SECOND: f64 = 1e8;
 
 /// How much more light the paths of a pass are taken to carry, at most, than those of the pass before: where the first
 /// guide comes between them, and else.
@@ -210,12 +211,19 @@ impl Run<'_> {
         Ok(())
     }
 
-    /// Makes room for all records at once, where their number is no wish beyond what memory holds.
+    /// Makes room for all records at once, as far as so many can come and their number is no wish beyond what memory holds.
     pub(crate) fn reserve_records(&mut self) {
-        let most =
-            (f64::from(self.options.max_records.min(MOST_RESERVED) as u32) * NEXT_PASS) as usize;
+        let film = self.context.tracer.scene().film().pixels() as f64;
+        let paths = match &self.options.budget {
+            Budget::Spp(spp) => film * f64::from(*spp),
+            Budget::Time(time) => time * MOST_PATHS_PER_SECOND,
+            Budget::Replay(passes) => film * passes.iter().map(|p| f64::from(p.spp)).sum::<f64>(),
+        };
+        let most = self.options.max_records.min(MOST_RESERVED) as f64;
         let width = self.context.tracer.columns().learned();
-        self.records.reserve(most, width);
+        let contexts = self.options.guide.looks_at_contexts();
+        self.records
+            .reserve(most.min(paths) as usize, width, contexts);
     }
 
     /// Share of the light-carrying paths of a pass of `spp` to keep, as many as [`Self::most_kept`] if about as many carry

@@ -341,9 +341,9 @@ impl RealNvp {
                         .for_each(|(u, word)| *u = to_unit(word));
                 }
             }
-            // Of all pixels together; the path's numbers take at most 16 groups.
+            // Of all pixels together; a path's numbers take far fewer groups.
             for (row, known) in known.chunks_exact_mut(2).enumerate() {
-                let words = stream.block(block * rows as u32 + row as u32, 16, 0);
+                let words = stream.block(block * rows as u32 + row as u32, u32::MAX, 0);
                 known.copy_from_slice(&film(&[to_unit(words[0]), to_unit(words[1])]));
             }
             self.sample_path(&mut u, &known, &mut q);

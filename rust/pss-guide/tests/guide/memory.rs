@@ -144,11 +144,9 @@ fn memory_is_bounded_and_the_rarest_cells_give_way() {
 fn the_factors_of_a_composite_share_their_memory() {
     let paths = World::DEFAULT.draw(20_000, None, 1);
     for name in places::ALL {
-        let short = options(&[("mixture-net", Value::from(common::epochs("mixture-net", 1)))]);
-        let given = if name.contains("net") {
-            short
-        } else {
-            Map::new()
+        let given = match name.split_once('+') {
+            Some((net, _)) => options(&[(net, Value::from(common::epochs(net, 1)))]),
+            None => Map::new(),
         };
         let facts = fitted(name, &given, &paths).describe();
         let factors = facts["factors"].as_array().unwrap();
