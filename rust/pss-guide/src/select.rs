@@ -61,14 +61,14 @@ pub struct Remaining {
 
 /// A gain's excess over one grows with the paths learned from by this power, and not beyond this factor. Of twelve scenes
 /// with four times the paths, the middle one's grew by a power of .25, the least one's by .17.
-const REFINEMENT: (f64, f64) = (0.2, 1.75);
+const REFINEMENT: (f64, f64) = (0.2, 2.0);
 
 impl Remaining {
-    /// How much more a guide that is refined gains over the paths to come than from `paths` alone: it draws half of all
-    /// from a fit to the other half, about.
-    fn refinement(&self, paths: f64) -> f64 {
+    /// How much more a guide that is refined gains over the paths to come than one fitted to `tried` of `paths` so far: it
+    /// draws half of all from a fit to the other half, about.
+    fn refinement(&self, tried: f64, paths: f64) -> f64 {
         let (power, most) = REFINEMENT;
-        let more = 0.5 * (paths + self.paths) / paths.max(1.0);
+        let more = 0.5 * (paths + self.paths) / tried.max(1.0);
         more.max(1.0).powf(power).min(most)
     }
 }
@@ -282,7 +282,7 @@ fn consider(
         let seconds = factors.iter().map(|&i| fits[i].seconds).sum();
         let training_share = training_share(&recipe, fitted_to, growth, seconds, remaining);
         let refinement = if recipe.refines() {
-            remaining.refinement(paths)
+            remaining.refinement(fitted_to.paths(), paths)
         } else {
             1.0
         };

@@ -26,8 +26,9 @@ fn variance(world: &World, selection: &Selection) -> f64 {
     error * error * estimates.len() as f64
 }
 
-/// Claim: the winner gains no less than two thirds of what it was promised, and no more than 2.5 times as much. Promises are
-/// meant to be cautious: what differs between the pixels of a tile counts as noise that stays.
+/// Claim: the winner gains no less than two thirds of what it was promised, and no more than four times as much. Promises are
+/// meant to be cautious: they are those of a fit to fewer paths, and what differs between the pixels of a tile counts as noise
+/// that stays.
 #[test]
 fn what_pays_is_chosen_and_its_gain_is_real() {
     let world = World::DEFAULT;
@@ -49,7 +50,7 @@ fn what_pays_is_chosen_and_its_gain_is_real() {
     let gain = variance(&world, &random) / variance(&world, &selection);
     let promised = report.predicted_gain;
     assert!(
-        gain > 4.0 && (0.4..1.5).contains(&(promised / gain)),
+        gain > 4.0 && (0.25..1.5).contains(&(promised / gain)),
         "promised {promised:.2}, real {gain:.2}"
     );
     assert_eq!(selection.candidates.iter().filter(|c| c.chosen).count(), 1);
