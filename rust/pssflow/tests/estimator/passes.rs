@@ -1,7 +1,4 @@
 //! Renders as lists of passes: what a plan says is what is rendered, and what goes wrong in one path stays there.
-#![allow(clippy::unwrap_used)]
-
-mod common;
 
 use std::path::Path;
 use std::sync::Arc;
@@ -13,7 +10,7 @@ use pssflow::{
 };
 use serde_json::Value;
 
-use common::furnace;
+use crate::common::furnace;
 
 /// The density is `q`, whatever the numbers are: wrong unless q = 1, so that a test can see its weights.
 #[derive(Debug)]
