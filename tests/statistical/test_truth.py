@@ -362,7 +362,7 @@ def _table_cases() -> list[Any]:
         ("glossy_room", "table", 0.1, 2, "mis"),
         ("open_sky", "table", 0.5, 2, "mis"),
         ("sun_and_sky", "table", 0.1, 3, "mis"),
-        ("cornell-box", "mixture-net", 0.1, 3, "mis"),
+        ("sun_and_sky", "mixture-net", 0.1, 3, "mis"),
         ("sun_and_sky", NET, 0.5, 2, "mis"),
         ("glass_room", "spline-net", 0.1, 2, "mis"),
         ("sun_and_sky", "auto", 0.1, 2, "nee"),

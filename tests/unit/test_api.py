@@ -144,7 +144,7 @@ def test_defaults(furnace):
     stats = furnace.render(progress=False).stats
     assert (stats["guide"], stats["k"], stats["combine"]) == ("auto", 2, "samples")
     assert (stats["parametrisation"], stats["emitter_strategy"]) == ("bsdf", "mis")
-    assert [entry["spp"] for entry in stats["passes"]] == [2, 2, 4, 8]
+    assert [entry["spp"] for entry in stats["passes"]] == [1, 1, 2, 4, 8]
     assert stats["passes"][0]["kind"] == "pilot"
     assert sum(candidate["chosen"] for candidate in stats["candidates"]) == 1
 

@@ -288,7 +288,12 @@ def test_a_scene_without_light_is_black_with_a_notice(parts, reason, guide, comm
 
 def test_ctrl_c_ends_soon_and_leaves_nothing(tmp_path):
     """From the start of the command on: while loading, learning or rendering."""
-    script = "import sys; from pssflow.cli import main; print('up', flush=True); sys.exit(main())"
+    script = (
+        "import signal, sys; from pssflow.cli import main; "
+        # A shell's background job, as these tests may be, ignores the signal and hands that on.
+        "signal.signal(signal.SIGINT, signal.default_int_handler); "
+        "print('up', flush=True); sys.exit(main())"
+    )
     arguments = ["render", CORNELL, "-o", "out.exr", "--time", "60", "--variant", "scalar_rgb"]
     with subprocess.Popen(
         [sys.executable, "-c", script, *map(str, arguments)],

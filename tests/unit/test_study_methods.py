@@ -39,6 +39,7 @@ def clock(monkeypatch) -> list[float]:
 
 
 def passes(render: FakePass, times: tuple[float, ...], seed: int = 0) -> list[Shot]:
+    """Film of 2×2."""
     scene: Any = SimpleNamespace(width=2, height=2)
     return methods._passes(render, "fake", seed, scene, times, None)  # pyright: ignore[reportArgumentType]
 
@@ -48,7 +49,7 @@ def test_no_pass_counts_that_ends_after_its_time(clock):
     render = FakePass(clock, [5.0, 0.4])
     first, last = passes(render, (1.7, 3.0))
     assert [round(shot.elapsed, 9) for shot in (first, last)] == [1.6, 2.8]
-    spp = methods.PATHS_PER_PASS // 4
+    spp = methods.PATHS_PER_PASS[0] // 4
     assert [shot.spp for shot in (first, last)] == [4 * spp, 7 * spp]
     assert first.image[0, 0, 0] == pytest.approx(np.mean([3, 4, 5, 6]))
     assert last.seconds["warm_up"] == pytest.approx(5.4)
@@ -62,8 +63,16 @@ def test_passes_are_cut_to_the_shortest_time(clock):
     """A pass of 1 s is too long for 1 s: a quarter of its samples, compiled and measured anew, takes 0.25 s."""
     render = FakePass(clock, [5.0, 1.0, 5.0, 0.25])
     (first, _) = passes(render, (1.0, 3.1))
-    assert first.spp == 4 * methods.PATHS_PER_PASS // 16
+    assert first.spp == 4 * methods.PATHS_PER_PASS[0] // 16
     assert first.seconds["warm_up"] == pytest.approx(11.25)
+
+
+def test_passes_grow_to_fill_their_share_of_the_shortest_time(clock):
+    """One of 0.1 s is short for 2 s: five times its samples would fill it, four times are the most."""
+    render = FakePass(clock, [5.0, 0.1, 5.0, 0.4])
+    (first, _) = passes(render, (2.0, 4.0))
+    assert first.spp == 4 * methods.PATHS_PER_PASS[1] // 4
+    assert first.elapsed == pytest.approx(1.6)
 
 
 def test_a_pass_that_turns_out_too_long_is_dropped(clock):

@@ -198,20 +198,20 @@ def _passes(
     start = time.perf_counter()
     longest = 0.0
 
-    def measure(spp: int) -> float:
+    def measure(spp: int, seed: int) -> float:
         """Seconds of a pass: its first one compiles, its second one tells."""
-        render(first - 1, spp)
+        render(seed, spp)
         begun = time.perf_counter()
-        render(first - 2, spp)
+        render(seed + 1, spp)
         return time.perf_counter() - begun
 
     if render.jit:
-        longest = measure(spp)
+        longest = measure(spp, first - 2)
         fitting = SHARE_OF_FIRST * times[0] / longest if longest > 0.0 else 1.0
         suits = min(max(int(spp * fitting), 1), most)
-        if suits != spp:
+        if suits != spp and not 1.0 <= fitting < 2.0:
             spp = suits
-            longest = measure(spp)
+            longest = measure(spp, first - 4)
     warm_up = time.perf_counter() - start
     state = Running.empty([scene.width, scene.height], spp)
     elapsed = 0.0

@@ -8,12 +8,12 @@ use crate::options::{Budget, Options, PassKind, PassPlan};
 /// Share of a time budget that the pilot may take, for a guide that is trained once and for one that is refined: later
 /// passes, of whose paths more carry light, teach the latter, too.
 const PILOT_TIME: [f64; 2] = [1.0 / 7.0, 1.0 / 10.0];
-/// Under `--spp`, one sample in so many is the pilot's, likewise.
-const PILOT_DIVISOR: [u32; 2] = [4, 32];
+/// Under `--spp`, one sample in so many is the pilot's, likewise, and for a guide that is refined at next to no cost.
+const PILOT_DIVISOR: [u32; 3] = [4, 8, 32];
 
 /// Share of a time budget that training is planned to take; what takes longer than the whole is given up.
 const TRAINING_TIME: f64 = 0.3;
-/// Paths that carry light of which a guide that is refined is first learned; a pilot that has found as many ends, and may
+/// Paths that carry light of which a guide that is refined at next to no cost is first learned; a pilot that has found as many ends, and may
 /// have taken no more than [`LEAST_PILOT_TIME`].
 const ENOUGH_TO_START: f64 = 65_536.0;
 const LEAST_PILOT_TIME: f64 = 1.0 / 40.0;
@@ -37,7 +37,9 @@ impl Run<'_> {
     pub(crate) fn by_samples(&mut self, total: u32) -> Result<(), RenderError> {
         let refines = self.options.guide.refines();
         if self.options.guide.learns() {
-            let usual = (total / PILOT_DIVISOR[usize::from(refines)]).max(1);
+            let cheap = refines && self.seconds_per_path() == 0.0;
+            let divisor = PILOT_DIVISOR[usize::from(refines) + usize::from(cheap)];
+            let usual = (total / divisor).max(1);
             let spp = self.options.pilot_spp.unwrap_or(usual).min(total);
             let record = self.record_share(PassKind::Pilot, spp);
             self.pass(PassKind::Pilot, spp, record, (0.0, 1.0))?;
@@ -162,14 +164,19 @@ impl Run<'_> {
             .unwrap_or_else(|| fit(end) as u32)
     }
 
+    /// Seconds of training that each path of the guide that was asked for costs.
+    fn seconds_per_path(&self) -> f64 {
+        let dims = self.context.tracer.columns().learned();
+        match &self.options.guide {
+            GuideChoice::Learn(learner) => learner.seconds_per_path(dims),
+            _ => 0.0,
+        }
+    }
+
     /// One sample a pixel, then as many more as its measured speed allows (or as were asked for), of which no
     /// more paths are kept than the guide can be trained on in its share of the time.
     fn timed_pilot(&mut self, time: f64) -> Result<(), RenderError> {
-        let dims = self.context.tracer.columns().learned();
-        let seconds_per_path = match &self.options.guide {
-            GuideChoice::Learn(learner) => learner.seconds_per_path(dims),
-            _ => 0.0,
-        };
+        let seconds_per_path = self.seconds_per_path();
         let refines = self.options.guide.refines();
         let start = self.clock.elapsed().as_secs_f64();
         let pixels = self.context.tracer.scene().film().pixels() as f64;
@@ -186,7 +193,7 @@ impl Run<'_> {
                 let within =
                     |share: f64| ((time * share - each) / each).clamp(0.0, f64::from(1 << 20));
                 let most = within(PILOT_TIME[usize::from(refines)]);
-                let enough = if refines {
+                let enough = if refines && seconds_per_path == 0.0 {
                     (ENOUGH_TO_START / lit.max(1.0)).max(within(LEAST_PILOT_TIME))
                 } else {
                     self.most_kept() as f64 / lit.max(1.0)
