@@ -127,7 +127,8 @@ def render(
             quarter or a seventh.
         keep_pilot: whether the pilot's paths enter the image. Default: yes.
         combine: how passes become one image: `samples` (default; every sample the same, but one of the pilot half) or
-            `variance` (each pass by its variance, estimated crosswise from halves of the image: less noise, a bias of the order of 1 ÷ spp).
+            `variance` (each pass by its variance, estimated crosswise from halves of the image: less noise, a bias of
+            the order of 1 ÷ spp).
         replay: the record of an earlier run (`Result.stats` or the command's JSON file), whose guide, settings, seed
             and passes are repeated, or only its `passes`.
         snapshots: shorter times, increasing, at which the image so far is handed out (`Result.snapshots`): the last one
