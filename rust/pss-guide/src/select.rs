@@ -109,8 +109,7 @@ pub struct Selection {
 
 /// The candidates of `auto`; every subset of a composite's factors is meant, too.
 ///
-/// `mixture-net` and `spline-net` are none yet: what the held-out paths promise of a net does not hold where few carry light
-/// (ARCHITECTURE.md).
+/// `mixture-net` and `spline-net` are none yet (ARCHITECTURE.md).
 ///
 /// # Errors
 /// None that the registry of this build does not cause.
