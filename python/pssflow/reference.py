@@ -172,18 +172,17 @@ def reference(
         approximate=own and scene.approximate,
     )
     hide = bool(exported.description["hide_emitters"])
-    way = KBouncePass if is_jit(mi_scene) and not hide else TruthPass
-    path = _writable_cache(cache, notices, exported, k, seed0, way.name)
+    renderer = (
+        KBouncePass(mi_scene, camera, k)
+        if is_jit(mi_scene) and not hide
+        else TruthPass(mi_scene, camera, k, hide=hide)
+    )
+    path = _writable_cache(cache, notices, exported, k, seed0, renderer.name)
     total = _load(path, notices) if path is not None else None
     reused = 0 if total is None else total.passes
     film = exported.description["film"]["crop_size"]
     if total is None:
         total = Running.empty(film, max(PATHS_PER_PASS // (film[0] * film[1]), 1))
-    renderer = (
-        KBouncePass(mi_scene, camera, k)
-        if way is KBouncePass
-        else TruthPass(mi_scene, camera, k, hide=hide)
-    )
     saved = time.monotonic()
     with reporting(progress) as listener:
         passes = _more(total, renderer, seed0, limit, target, listener)
@@ -208,7 +207,7 @@ def reference(
         passes=total.passes,
         spp=total.spp,
         seconds=total.seconds,
-        note="; ".join([f"{way.name}, {mi_scene.variant_name()}, {ending}{origin}", *notices]),
+        note="; ".join([f"{renderer.name}, {mi_scene.variant_name()}, {ending}{origin}", *notices]),
         k=k,
         path=path,
         reached=reached,

@@ -14,9 +14,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from tests.conftest import LLVM, ROOT, SCALAR
-from tests.scenes import SCENES
-from tests.support.runs import Runs, truth_runs
+from tests.conftest import LLVM, SCALAR
+from tests.support.named import load_named
+from tests.support.runs import Runs, integrator_runs, truth_runs
 from tests.support.welch import ALPHA, welch
 
 pytestmark = [pytest.mark.stat, pytest.mark.timeout(600)]
@@ -31,23 +31,13 @@ SPP |= {
     "teapot": 128,
 }
 """Of each run."""
-SHIPPED = ("cornell-box", "many-lights", "teapot")
 QUICK = {("glass_room", 1), ("glass_room", 2), ("cornell-box", 3)}
 """Every delta lobe, where NEE alone is blind; three bounces."""
 
 
-def _load(name: str) -> Any:
-    if name in SHIPPED:
-        side = 32 if name == "many-lights" else 64
-        return mi.load_file(str(ROOT / "scenes" / name / "scene.xml"), resolution=side)
-    return mi.load_dict(SCENES[name]())
-
-
 def _kbounce_runs(scene: Any, *, k: int, seeds: range, spp: int) -> Runs:
-    integrator: Any = mi.load_dict({"type": "pssflow_kbounce", "k": k})
-    render: Any = mi.render
-    images = [np.array(render(scene, integrator=integrator, spp=spp, seed=s)) for s in seeds]
-    return np.stack(images)[..., :3]
+    integrator = {"type": "pssflow_kbounce", "k": k}
+    return integrator_runs(scene, integrator, seeds=seeds, spp=spp)
 
 
 @pytest.mark.parametrize(
@@ -60,7 +50,7 @@ def _kbounce_runs(scene: Any, *, k: int, seeds: range, spp: int) -> Runs:
 def test_its_mean_is_the_difference_of_two_depths(name: str, k: int, artifacts: Path) -> None:
     """H0: equal means; and the same runs with 3 % more light fail, so that this could have failed."""
     mi.set_variant(LLVM)
-    scene = _load(name)
+    scene = load_named(name)
     truth = truth_runs(scene, k=k, seeds=range(RUNS), spp=SPP[name])
     ours = _kbounce_runs(scene, k=k, seeds=range(1000, 1000 + RUNS), spp=SPP[name])
     r = welch(truth, ours)
@@ -75,8 +65,8 @@ def test_its_mean_is_the_difference_of_two_depths(name: str, k: int, artifacts: 
 def test_in_scalar_variants_the_mean_is_the_same(k: int, artifacts: Path) -> None:
     """H0: equal means of `scalar_rgb`, path by path in Python, and the difference in `llvm_ad_rgb`. 4 spp × 8 seeds."""
     mi.set_variant(LLVM)
-    truth = truth_runs(_load("glass_room"), k=k, seeds=range(RUNS), spp=64)
+    truth = truth_runs(load_named("glass_room"), k=k, seeds=range(RUNS), spp=64)
     mi.set_variant(SCALAR)
-    ours = _kbounce_runs(_load("glass_room"), k=k, seeds=range(1000, 1008), spp=4)
+    ours = _kbounce_runs(load_named("glass_room"), k=k, seeds=range(1000, 1008), spp=4)
     r = welch(truth, ours)
     assert r.p > ALPHA / 2, r.explain(artifacts)

@@ -18,10 +18,11 @@ import numpy as np
 import pytest
 
 from pssflow import _core
-from tests.conftest import LLVM, ROOT
+from tests.conftest import LLVM
 from tests.scenes import SCENES
 from tests.support.core import core_scene, our_runs, render
 from tests.support.lights import LIGHTS, MISSED_BY_MITSUBA, light
+from tests.support.named import HARD, SHIPPED, load_named
 from tests.support.runs import Runs, mitsuba_runs, truth_runs
 from tests.support.welch import ALPHA, welch
 
@@ -47,10 +48,6 @@ SPP = {
     "white-room": 64,
 }
 """Of each run: more where two-bounce light is noisier."""
-SHIPPED = ("cornell-box", "teapot")
-"""Reduced to 64 × 64 pixels."""
-HARD = ("courtyard", "door-ajar", "glossy", "leaves", "many-lights", "white-room")
-"""Shipped as well, reduced to 32 × 32 pixels: each for one reason why light is hard to find, the last for none."""
 SMALL = ("furnace_sphere", "glossy_room", "open_sky", "sun_and_sky", "glass_room", "carved_room")
 """`quad` has a test of its own: its two-bounce light is zero."""
 BLIND = ("glass_room", "carved_room", "leaves")
@@ -59,11 +56,7 @@ BLIND = ("glass_room", "carved_room", "leaves")
 
 def _load(name: str) -> mi.Scene:
     mi.set_variant(LLVM)
-    if name in SHIPPED:
-        return mi.load_file(str(ROOT / "scenes" / name / "scene.xml"), resolution=64)
-    if name in HARD:
-        return mi.load_file(str(ROOT / "scenes" / name / "scene.xml"), resolution=32)
-    return mi.load_dict(SCENES[name]())
+    return load_named(name)
 
 
 @functools.cache

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -19,10 +20,18 @@ def mitsuba_runs(scene: mi.Scene, *, max_depth: int, seeds: Iterable[int], spp: 
     # Roulette would draw numbers and end paths that the difference of two depths needs.
     hide = bool(getattr(scene.integrator(), "hide_emitters", False))
     depths = {"max_depth": max_depth, "rr_depth": max_depth + 2}
-    path = mi.load_dict({"type": "path", "hide_emitters": hide, **depths})
+    path = {"type": "path", "hide_emitters": hide, **depths}
+    return integrator_runs(scene, path, seeds=seeds, spp=spp)
+
+
+def integrator_runs(
+    scene: mi.Scene, integrator: dict[str, Any], *, seeds: Iterable[int], spp: int
+) -> Runs:
+    """Any integrator, as a dictionary, one image a seed, in the scene's own film."""
+    loaded = mi.load_dict(integrator)
     images = []
     for seed in seeds:
-        image = mi.render(scene, integrator=path, spp=spp, seed=seed)  # pyright: ignore[reportArgumentType]
+        image = mi.render(scene, integrator=loaded, spp=spp, seed=seed)  # pyright: ignore[reportArgumentType]
         images.append(np.array(image, dtype=np.float32)[..., :3])
     return np.stack(images)
 

@@ -5,6 +5,9 @@ use serde_json::{Map, Value};
 
 use crate::GuideError;
 
+/// Memory of a guide that bounds it, where nothing else is asked for.
+pub(crate) const MEMORY_MIB: usize = 256;
+
 /// What a whole-path guide looks at.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]

@@ -13,8 +13,8 @@ pub const ALIASES: [(&str, &str); 1] = [("table", "direction-table+emitter-table
 /// Share of uniform paths that a factor assumes in the mixture when it looks past the factors before it.
 const DEFENSIVE: f32 = 0.1;
 
-/// Bytes that the factors of a composite share: as many as a table alone may take by default.
-const SHARED: u64 = 256 << 20;
+/// Bytes that the factors of a composite share: as many as a guide alone may take by default.
+const SHARED: u64 = (crate::options::MEMORY_MIB as u64) << 20;
 
 /// What of [`SHARED`] is kept for each factor that is still to be fitted.
 const RESERVED: u64 = SHARED / 8;

@@ -13,8 +13,8 @@ const PILOT_DIVISOR: [u32; 3] = [4, 8, 32];
 
 /// Share of a time budget that training is planned to take; what takes longer than the whole is given up.
 const TRAINING_TIME: f64 = 0.3;
-/// Paths that carry light of which a guide that is refined at next to no cost is first learned; a pilot that has found as many ends, and may
-/// have taken no more than [`LEAST_PILOT_TIME`].
+/// Paths that carry light of which a guide that is refined at next to no cost is first learned; a pilot that has found as
+/// many ends, and may have taken no more than [`LEAST_PILOT_TIME`].
 const ENOUGH_TO_START: f64 = 65_536.0;
 const LEAST_PILOT_TIME: f64 = 1.0 / 40.0;
 
@@ -37,7 +37,7 @@ impl Run<'_> {
     pub(crate) fn by_samples(&mut self, total: u32) -> Result<(), RenderError> {
         let refines = self.options.guide.refines();
         if self.options.guide.learns() {
-            let cheap = refines && self.seconds_per_path() == 0.0;
+            let cheap = self.refines_cheaply();
             let divisor = PILOT_DIVISOR[usize::from(refines) + usize::from(cheap)];
             let usual = (total / divisor).max(1);
             let spp = self.options.pilot_spp.unwrap_or(usual).min(total);
@@ -115,7 +115,6 @@ impl Run<'_> {
                 break;
             }
             let mut teaches = refines && !self.current.settled;
-            let mut record = 0.0;
             if let Some(each) = each {
                 // What a snapshot cut short does not slow the doubling down.
                 let doubled = if teaches {
@@ -132,9 +131,11 @@ impl Run<'_> {
                     break;
                 }
             }
-            if teaches {
-                record = self.record_share(self.kind(), spp);
-            }
+            let record = if teaches {
+                self.record_share(self.kind(), spp)
+            } else {
+                0.0
+            };
             let share = |t: f64| ((t - begin) / (time - begin).max(1e-9)).clamp(0.0, 1.0) as f32;
             let span = (
                 share(now),
@@ -173,6 +174,11 @@ impl Run<'_> {
         }
     }
 
+    /// Whether the guide is refined at next to no cost: then a short pilot will do, since better paths soon teach it.
+    fn refines_cheaply(&self) -> bool {
+        self.options.guide.refines() && self.seconds_per_path() == 0.0
+    }
+
     /// One sample a pixel, then as many more as its measured speed allows (or as were asked for), of which no
     /// more paths are kept than the guide can be trained on in its share of the time.
     fn timed_pilot(&mut self, time: f64) -> Result<(), RenderError> {
@@ -193,7 +199,7 @@ impl Run<'_> {
                 let within =
                     |share: f64| ((time * share - each) / each).clamp(0.0, f64::from(1 << 20));
                 let most = within(PILOT_TIME[usize::from(refines)]);
-                let enough = if refines && seconds_per_path == 0.0 {
+                let enough = if self.refines_cheaply() {
                     (ENOUGH_TO_START / lit.max(1.0)).max(within(LEAST_PILOT_TIME))
                 } else {
                     self.most_kept() as f64 / lit.max(1.0)

@@ -160,29 +160,38 @@ impl Options {
         match kind {
             Kind::Mixture => {
                 let own: MixtureNetOptions = filled(kind, given)?;
-                let accepted = (1..=64).contains(&own.components);
-                let rules = Rules::new(kind.name(), &own);
-                rules.check("components", accepted, "1 to 64 components")?;
-                own.net.check(&rules)?;
-                let map = options::to_map(&own);
-                let head = Head::Mixture(Mixture {
-                    components: own.components,
-                });
-                let net = own.net;
-                Ok(Self { head, net, map })
+                let components = own.components;
+                let accepted = (1..=64).contains(&components);
+                let rule = ("components", accepted, "1 to 64 components");
+                let head = Head::Mixture(Mixture { components });
+                Self::checked(kind, head, rule, &own, &own.net)
             }
             Kind::Spline => {
                 let own: SplineNetOptions = filled(kind, given)?;
-                let accepted = (2..=64).contains(&own.bins);
-                let rules = Rules::new(kind.name(), &own);
-                rules.check("bins", accepted, "2 to 64 bins")?;
-                own.net.check(&rules)?;
-                let map = options::to_map(&own);
-                let head = Head::Spline(Spline { bins: own.bins });
-                let net = own.net;
-                Ok(Self { head, net, map })
+                let bins = own.bins;
+                let rule = ("bins", (2..=64).contains(&bins), "2 to 64 bins");
+                let head = Head::Spline(Spline { bins });
+                Self::checked(kind, head, rule, &own, &own.net)
             }
         }
+    }
+
+    /// All options of one net, after the head's own rule and those that all nets have.
+    fn checked<T: Serialize>(
+        kind: Kind,
+        head: Head,
+        (name, accepted, rule): (&str, bool, &'static str),
+        all: &T,
+        net: &NetOptions,
+    ) -> Result<Self, GuideError> {
+        let rules = Rules::new(kind.name(), all);
+        rules.check(name, accepted, rule)?;
+        net.check(&rules)?;
+        Ok(Self {
+            head,
+            net: net.clone(),
+            map: options::to_map(all),
+        })
     }
 
     /// Units of the layers of each network.

@@ -44,7 +44,7 @@ impl Default for TableOptions {
             kappa: None,
             bins: None,
             depth: None,
-            memory_mib: 256,
+            memory_mib: options::MEMORY_MIB,
             clip_quantile: 0.999,
         }
     }
