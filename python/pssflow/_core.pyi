@@ -32,6 +32,7 @@ class Guide:
         *,
         f_max: F32 | None = None,
         f_bsdf: F32 | None = None,
+        ray: F32 | None = None,
         g: F32 | None = None,
         zeros: int = 0,
         contexts: dict[str, NDArray[Any]] | None = None,

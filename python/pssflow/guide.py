@@ -114,6 +114,7 @@ class Guide:
         f: ArrayLike,
         *,
         f_bsdf: ArrayLike | None = None,
+        ray: ArrayLike | None = None,
         g: ArrayLike | None = None,
         zeros: int = 0,
         contexts: Mapping[str, ArrayLike] | None = None,
@@ -140,6 +141,7 @@ class Guide:
             u: see above.
             f: see above; of RGB values the luminance, and for resampling the largest component, is learned.
             f_bsdf: the part of f that the emitter's and the light's numbers do not decide, shaped as f; None for 0.
+            ray: numbers of the BSDF-sampled ray at the last vertex, (n, 2); None where there is none.
             g: see above.
             contexts: see above.
             emitters: per emitter the upper end of its interval of the emitter's number and whether it surrounds the
@@ -175,6 +177,7 @@ class Guide:
             np.ascontiguousarray(luminance[lit]),
             f_max=np.ascontiguousarray(largest[lit]),
             f_bsdf=None if term is None else np.ascontiguousarray(term[lit]),
+            ray=None if ray is None else _rows(np.asarray(ray)[lit]),
             g=np.ascontiguousarray(density[lit]),
             contexts=None if contexts is None else _vertices(contexts, lit),
             pixel=None if pixel is None else _rows(np.asarray(pixel)[lit]),
@@ -226,7 +229,8 @@ class Guide:
         Args:
             n: rows.
             seed: the same seed gives the same rows.
-            decision: one of `models`: `path` (all numbers at once), `direction` (d = 2), `emitter` (1) or `light` (2).
+            decision: one of `models`: `path` (all numbers at once), `direction` (d = 2), `emitter` (1), `light` (2) or
+                `ray` (2), the BSDF-sampled one at the last vertex.
             contexts: where it is taken, a row each, for guides that look: `position`, `normal`, `outgoing` (n, 3),
                 `pixel` (n, 2), `emitter`, `bounce` (n,); what is missing is zero, and bounce 1.
 

@@ -86,7 +86,8 @@ class Pilot(Trace):
     columns: list[str] = field(default_factory=list)
     """What each column of `u` decides."""
     learned: int = 0
-    """How many of the columns a guide of the whole path models: 2k+1, the first ones."""
+    """How many of the columns a guide of the whole path models: 2k+1, the first ones; with `mis` two of the
+    BSDF-sampled ray follow."""
     columns_hash: str = ""
     """What a saved guide is checked against; see `Guide.load`."""
     scene_hash: str = ""
@@ -139,6 +140,7 @@ class Pilot(Trace):
             self.u[:, : self.learned],
             self.f,
             f_bsdf=self.f_bsdf,
+            ray=self.u[:, self.learned :] if self.u.shape[1] > self.learned else None,
             g=self.g,
             contexts={
                 name: getattr(self, name)

@@ -340,8 +340,8 @@ def test_a_flow_that_looks_at_the_pixel_gives_mitsubas_mean(
     assert r.has_power, r.explain(artifacts)
 
 
-NET = "mixture-net+emitter-table+light-table"
-SPLINES = "spline-net+emitter-table+light-table"
+NET = "mixture-net+emitter-table+light-table+ray-table"
+SPLINES = "spline-net+emitter-table+light-table+ray-table"
 TABLES = (
     *("direction-table", "emitter-table", "light-table", "table"),
     *("mixture-net", NET, "spline-net", SPLINES, "auto"),

@@ -153,7 +153,7 @@ def test_tables_are_fitted_and_asked_in_python(furnace):
     """The density of a cell's numbers integrates to one, and samples are distributed as it says."""
     pilot = furnace.pilot(spp=64, k=2)
     guide = pilot.fit("table")
-    assert guide.models == ["direction", "emitter", "light"]
+    assert guide.models == ["direction", "emitter", "light", "ray"]
     n = 20_000
     row = int(np.flatnonzero(pilot.f.any(axis=1))[0])
     place = {

@@ -377,7 +377,7 @@ def test_auto_says_why(command):
 
 @pytest.mark.parametrize(
     ("guide", "chosen"),
-    [("realnvp", "realnvp"), ("table", "direction-table+emitter-table+light-table")],
+    [("realnvp", "realnvp"), ("table", "direction-table+emitter-table+light-table+ray-table")],
 )
 def test_a_saved_guide_is_used_again_and_refused_elsewhere(guide, chosen, command):
     learned = ("--guide", guide, "--save-guide", "g.safetensors")

@@ -11,7 +11,7 @@ from .command import Defaults, study_command
 __all__ = ["guides"]
 
 STANDARD = ("none", "realnvp", "direction-table", "table")
-NET = "mixture-net+emitter-table+light-table"
+NET = "mixture-net+emitter-table+light-table+ray-table"
 
 
 def standard(full: bool) -> list[str]:

@@ -66,7 +66,7 @@ fn measure(wanted: &[String]) -> Result<(), GuideError> {
         let width = match decision {
             Decision::Path => DIMS,
             Decision::Emitter => 1,
-            Decision::Direction | Decision::Light => 2,
+            Decision::Direction | Decision::Light | Decision::Ray => 2,
         };
         let epochs = if (spec.defaults)().contains_key("epochs") {
             2

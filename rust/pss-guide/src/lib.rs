@@ -57,6 +57,8 @@ pub enum Decision {
     Emitter,
     /// The two numbers of a position on the emitter.
     Light,
+    /// The two numbers of the BSDF-sampled ray at the last vertex, where light is looked for that way, too.
+    Ray,
 }
 
 /// What is known where a decision is taken; fields that a decision does not have are zero.

@@ -7,8 +7,8 @@
 //! error): the best of many candidates is else the one that chance favours.
 //!
 //! The spread between the pixels of a tile counts as noise that no guide removes, which makes gains conservative. Of the
-//! two terms of f each is divided by the density of its own numbers: f_nee²/m + (2 f_nee f_bsdf + f_bsdf²)/m′ with the
-//! directions' marginal m′.
+//! two terms of f each is divided by the density of its own numbers, m_nee and m_bsdf, while the density of all numbers
+//! is m: f_nee²/m_nee + f_bsdf²/m_bsdf + 2 f_nee f_bsdf · m/(m_nee m_bsdf).
 
 use crate::{Decision, Guide, Records};
 
@@ -24,40 +24,59 @@ const MOST_GAIN: f64 = 1000.0;
 /// A guide's densities of some paths' numbers.
 #[derive(Clone, Debug)]
 pub(crate) struct Densities {
-    /// Of all numbers.
-    pub(crate) all: Vec<f32>,
+    /// Of the numbers that f_nee uses.
+    pub(crate) nee: Vec<f32>,
     /// Of those that the BSDF-sampled term uses.
-    pub(crate) directions: Vec<f32>,
+    pub(crate) bsdf: Vec<f32>,
+    /// Of all.
+    pub(crate) both: Vec<f32>,
 }
 
 impl Densities {
     /// Of a guide at each of the paths.
     pub(crate) fn of(guide: &dyn Guide, records: &Records<'_>) -> Self {
-        let mut all = vec![1.0; records.f.len()];
-        records.multiply_densities(guide, &mut all);
-        let whole = guide.models().contains(&Decision::Path);
-        let directions = if whole || guide.models().contains(&Decision::Direction) {
-            let only = |d: &Decision| matches!(d, Decision::Path | Decision::Direction);
-            if guide.models().iter().all(only) {
-                all.clone()
-            } else {
-                let mut directions = vec![1.0; records.f.len()];
-                records.multiply_density(guide, Decision::Direction, &mut directions);
-                directions
-            }
-        } else {
-            vec![1.0; records.f.len()]
-        };
-        Self { all, directions }
+        let one = Self::one(records.f.len());
+        guide
+            .models()
+            .iter()
+            .fold(one, |q, &decision| q.with(guide, decision, records))
+    }
+
+    /// Of uniform numbers.
+    pub(crate) fn one(rows: usize) -> Self {
+        let one = vec![1.0; rows];
+        Self {
+            nee: one.clone(),
+            bsdf: one.clone(),
+            both: one,
+        }
+    }
+
+    /// With the guide's density of one more decision.
+    fn with(mut self, guide: &dyn Guide, decision: Decision, records: &Records<'_>) -> Self {
+        let mut own = vec![1.0; records.f.len()];
+        records.multiply_density(guide, decision, &mut own);
+        multiply(&mut self.both, &own);
+        if decision != Decision::Ray {
+            multiply(&mut self.nee, &own);
+        }
+        if !matches!(decision, Decision::Emitter | Decision::Light) {
+            multiply(&mut self.bsdf, &own);
+        }
+        self
     }
 
     /// Of the product with another guide that models other numbers.
     pub(crate) fn times(mut self, other: &Self) -> Self {
-        let multiply = |a: &mut [f32], b: &[f32]| a.iter_mut().zip(b).for_each(|(a, b)| *a *= b);
-        multiply(&mut self.all, &other.all);
-        multiply(&mut self.directions, &other.directions);
+        multiply(&mut self.nee, &other.nee);
+        multiply(&mut self.bsdf, &other.bsdf);
+        multiply(&mut self.both, &other.both);
         self
     }
+}
+
+fn multiply(a: &mut [f32], b: &[f32]) {
+    a.iter_mut().zip(b).for_each(|(a, b)| *a *= b);
 }
 
 /// Held-out paths, ready for predictions.
@@ -112,11 +131,7 @@ impl<'a> HeldOut<'a> {
             held.square += pairs * (mean * mean - own) / size;
         }
         held.means = means;
-        let one = vec![1.0; held.records.f.len()];
-        let one = Densities {
-            all: one.clone(),
-            directions: one,
-        };
+        let one = Densities::one(held.records.f.len());
         held.uniform = held.variance(&one, 1.0).0;
         // Below that, what looks like variance is rounding.
         (held.uniform > 1e-6 * held.square.abs()).then_some(held)
@@ -154,8 +169,10 @@ impl<'a> HeldOut<'a> {
         let mut changes = vec![0.0; self.scale.len()];
         for row in self.rows() {
             let terms = self.records.terms(row);
-            let value = terms.nee_square() / mixture(q.all[row])
-                + terms.bsdf_square() / mixture(q.directions[row]);
+            let [nee, bsdf, both] = [&q.nee, &q.bsdf, &q.both].map(|q| mixture(q[row]));
+            // Where densities are infinite nothing is left of either term: `max` makes 0 of ∞/∞.
+            let product = terms.product() * (both / (nee * bsdf)).max(0.0);
+            let value = terms.nee_square() / nee + terms.bsdf_square() / bsdf + product;
             let tile = self.tile(row);
             sum += value * self.scale[tile];
             let change = (value - 2.0 * self.means[tile] * terms.value()) * self.scale[tile];

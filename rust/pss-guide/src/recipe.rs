@@ -3,12 +3,16 @@
 use serde_json::{Map, Value};
 
 use crate::composite::Composite;
+use crate::predict::Densities;
 use crate::registry::{self, GuideSpec};
 use crate::select::is_idle;
 use crate::{Decision, Fit, Guide, GuideError, Records};
 
 /// Names that stand for a composite.
-pub const ALIASES: [(&str, &str); 1] = [("table", "direction-table+emitter-table+light-table")];
+pub const ALIASES: [(&str, &str); 1] = [(
+    "table",
+    "direction-table+emitter-table+light-table+ray-table",
+)];
 
 /// Share of uniform paths that a factor assumes in the mixture when it looks past the factors before it.
 const DEFENSIVE: f32 = 0.1;
@@ -161,11 +165,18 @@ impl Recipe {
         seed: u64,
         progress: &mut dyn FnMut(f32) -> bool,
     ) -> Result<Vec<Fit>, GuideError> {
-        let (mut g, mut fitted) = (records.g.to_vec(), Vec::<Fit>::new());
-        let mut q = vec![1.0f32; records.f.len()];
+        let rows = records.f.len();
+        let mut drawn = [records.g, records.g_bsdf, records.g_both].map(<[f32]>::to_vec);
+        let (mut q, mut fitted) = (Densities::one(rows), Vec::<Fit>::new());
         let mut left = SHARED;
         for (i, (spec, options)) in self.factors.iter().enumerate() {
-            let seen = Records { g: &g, ..*records };
+            let [g, g_bsdf, g_both] = &drawn;
+            let seen = Records {
+                g,
+                g_bsdf,
+                g_both,
+                ..*records
+            };
             let share = |done: f32| (i as f32 + done) / self.factors.len() as f32;
             let (mut options, told) = (options.clone(), options.contains_key(MEMORY));
             if bounded(spec) && !told {
@@ -179,10 +190,13 @@ impl Recipe {
                 left = left.saturating_sub(used.unwrap_or(0));
             }
             if i + 1 < self.factors.len() {
-                records.multiply_densities(&*fit.guide, &mut q);
-                for ((g, &drawn), &q) in g.iter_mut().zip(records.g).zip(&q) {
-                    *g = drawn * (DEFENSIVE + (1.0 - DEFENSIVE) * q);
-                }
+                q = q.times(&Densities::of(&*fit.guide, records));
+                let mixed = |q: f32| DEFENSIVE + (1.0 - DEFENSIVE) * q;
+                drawn = std::array::from_fn(|part| {
+                    let q = [&q.nee, &q.bsdf, &q.both][part];
+                    let all = (0..rows).map(|row| records.densities(row)[part] * mixed(q[row]));
+                    all.collect()
+                });
             }
             fitted.push(fit);
         }

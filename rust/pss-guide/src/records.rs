@@ -24,12 +24,14 @@ pub struct Emitter {
 /// | `f`        | `n`        | luminance of the undivided contribution, both terms                            |
 /// | `f_bsdf`   | `n` or 0   | the part of it that the emitter's and the light's numbers do not decide        |
 /// | `f_max`    | `n`        | its largest RGB component                                                      |
+/// | `ray`      | `n` or 0   | the two numbers of the BSDF-sampled ray at x_k                                 |
 /// | `g`        | `n`        | density that `u` was drawn from, times the share of such paths that was kept   |
-/// | `g_bsdf`   | `n` or 0   | the same for the directions' numbers alone (a marginal of `g`); `g` if empty   |
+/// | `g_bsdf`   | `n` or 0   | the same for the numbers that f_bsdf uses: the directions' and the ray's       |
+/// | `g_both`   | `n` or 0   | the same for all numbers                                                       |
 /// | `contexts` | `(n, k)` or 0 | x₁ … x_k; the last one's `emitter` is the one chosen                        |
 /// | `pixel`    | `n` or 0   | film position in [0, 1)²                                                       |
 ///
-/// Only non-zero paths need be given: zeros carry no gradient and are counted in `zeros`, so that the mean of f is
+/// Where `g_bsdf` or `g_both` is empty it is `g`, as of uniform numbers. Only non-zero paths need be given: zeros carry no gradient and are counted in `zeros`, so that the mean of f is
 /// Σ f/g ÷ (n + zeros). `Default` has no path.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Records<'a> {
@@ -43,10 +45,14 @@ pub struct Records<'a> {
     pub f_bsdf: &'a [f32],
     /// Largest RGB components, `n`.
     pub f_max: &'a [f32],
-    /// Densities of the draw, `n`.
+    /// Numbers of the BSDF-sampled ray, `n` (or none).
+    pub ray: &'a [[f32; 2]],
+    /// Densities of `u`, `n`.
     pub g: &'a [f32],
-    /// Their marginals over the directions' numbers, `n` (or none: the same as `g`).
+    /// Densities of the numbers that the BSDF-sampled term uses, `n` (or none: the same as `g`).
     pub g_bsdf: &'a [f32],
+    /// Densities of all numbers, `n` (or none: the same as `g`).
+    pub g_both: &'a [f32],
     /// Vertices, `n · k` (or none).
     pub contexts: &'a [Context],
     /// Film positions, `n` (or none).
@@ -64,6 +70,7 @@ pub(crate) struct Terms {
     pub(crate) f_bsdf: f64,
     pub(crate) g: f64,
     pub(crate) g_bsdf: f64,
+    pub(crate) g_both: f64,
 }
 
 impl Terms {
@@ -72,14 +79,19 @@ impl Terms {
         self.f_nee * self.f_nee / self.g
     }
 
-    /// Estimate of ∫(2 f_nee f_bsdf + f_bsdf²). The product needs all numbers, the square the directions' alone.
+    /// Estimate of ∫f_bsdf² over the directions' numbers and the ray's.
     pub(crate) fn bsdf_square(&self) -> f64 {
-        2.0 * self.f_nee * self.f_bsdf / self.g + self.f_bsdf * self.f_bsdf / self.g_bsdf
+        self.f_bsdf * self.f_bsdf / self.g_bsdf
+    }
+
+    /// Estimate of ∫2 f_nee f_bsdf, which needs all numbers.
+    pub(crate) fn product(&self) -> f64 {
+        2.0 * self.f_nee * self.f_bsdf / self.g_both
     }
 
     /// Estimate of ∫f².
     pub(crate) fn square(&self) -> f64 {
-        self.nee_square() + self.bsdf_square()
+        self.nee_square() + self.bsdf_square() + self.product()
     }
 
     /// Estimate of ∫f.
@@ -118,11 +130,27 @@ impl Records<'_> {
     /// A row's terms: f_nee, f_bsdf, and the densities that belong to them.
     pub(crate) fn terms(&self, row: usize) -> Terms {
         let f_bsdf = self.f_bsdf.get(row).map_or(0.0, |&f| f64::from(f).max(0.0));
+        let [g, g_bsdf, g_both] = self.densities(row).map(f64::from);
         Terms {
             f_nee: (f64::from(self.f[row]) - f_bsdf).max(0.0),
             f_bsdf,
-            g: f64::from(self.g[row]),
-            g_bsdf: f64::from(*self.g_bsdf.get(row).unwrap_or(&self.g[row])),
+            g,
+            g_bsdf,
+            g_both,
+        }
+    }
+
+    /// A row's `g`, `g_bsdf` and `g_both`.
+    pub(crate) fn densities(&self, row: usize) -> [f32; 3] {
+        let g = self.g[row];
+        [self.g, self.g_bsdf, self.g_both].map(|all| *all.get(row).unwrap_or(&g))
+    }
+
+    /// The numbers of a decision whose columns are `columns`.
+    pub(crate) fn numbers(&self, decision: Decision, row: usize, columns: Range<usize>) -> &[f32] {
+        match decision {
+            Decision::Ray => &self.ray[row],
+            _ => &self.u[row * self.dims..][columns],
         }
     }
 
@@ -152,13 +180,15 @@ impl Records<'_> {
     pub(crate) fn is_sound(&self, row: usize) -> bool {
         self.f[row].is_finite()
             && self.f_max[row].is_finite()
-            && self.g[row].is_finite()
-            && self.g[row] > 0.0
             && self.f_bsdf.get(row).is_none_or(|f| f.is_finite())
             && self
-                .g_bsdf
+                .densities(row)
+                .iter()
+                .all(|&g| g.is_finite() && g > 0.0)
+            && self
+                .ray
                 .get(row)
-                .is_none_or(|&g| g.is_finite() && g > 0.0)
+                .is_none_or(|u| u.iter().all(|u| (0.0..1.0).contains(u)))
             && self.u[row * self.dims..(row + 1) * self.dims]
                 .iter()
                 .all(|u| (0.0..1.0).contains(u))
@@ -169,30 +199,28 @@ impl Records<'_> {
         self.f.len() as f64 + self.zeros as f64
     }
 
-    /// The columns of a decision, for each vertex where it is taken.
+    /// The columns of a decision, for each vertex where it is taken; those of the ray are counted by themselves, and it is
+    /// taken nowhere where no path has it.
     pub(crate) fn columns(
         &self,
         decision: Decision,
     ) -> impl Iterator<Item = (usize, Range<usize>)> + use<> {
-        let k = self.bounces();
-        let (vertices, width) = match decision {
-            Decision::Path => (0..1, self.dims),
-            Decision::Direction => (0..k.saturating_sub(1), 2),
-            Decision::Emitter | Decision::Light => (k.saturating_sub(1)..k, 1),
+        let (k, dims) = (self.bounces(), self.dims);
+        let last = k.saturating_sub(1)..k;
+        let vertices = match decision {
+            Decision::Path => 0..1,
+            Decision::Direction => 0..k.saturating_sub(1),
+            Decision::Ray if self.ray.is_empty() => k..k,
+            Decision::Emitter | Decision::Light | Decision::Ray => last,
         };
         let at = move |vertex: usize| match decision {
-            Decision::Path | Decision::Direction => vertex * 2..vertex * 2 + width,
+            Decision::Path => 0..dims,
+            Decision::Direction => vertex * 2..vertex * 2 + 2,
             Decision::Emitter => 2 * k - 2..2 * k - 1,
             Decision::Light => 2 * k - 1..2 * k + 1,
+            Decision::Ray => 0..2,
         };
         vertices.map(move |vertex| (vertex, at(vertex)))
-    }
-
-    /// Multiplies into `q` the guide's density of each path, decision by decision.
-    pub(crate) fn multiply_densities(&self, guide: &dyn Guide, q: &mut [f32]) {
-        for &decision in guide.models() {
-            self.multiply_density(guide, decision, q);
-        }
     }
 
     /// Multiplies into `q` the guide's density of one decision.
@@ -206,7 +234,7 @@ impl Records<'_> {
                 u.clear();
                 contexts.clear();
                 for row in rows.clone() {
-                    u.extend_from_slice(&self.u[row * self.dims..][columns.clone()]);
+                    u.extend_from_slice(self.numbers(decision, row, columns.clone()));
                 }
                 if guide.looks_at_contexts(decision) {
                     contexts.extend(rows.map(|row| self.known(decision, row, vertex)));
@@ -240,7 +268,9 @@ impl Records<'_> {
         for (array, found, expected) in [
             ("pixel", self.pixel.len(), rows),
             ("f_bsdf", self.f_bsdf.len(), rows),
+            ("ray", self.ray.len(), rows),
             ("g_bsdf", self.g_bsdf.len(), rows),
+            ("g_both", self.g_both.len(), rows),
             ("contexts", self.contexts.len(), rows * self.bounces()),
         ] {
             if found > 0 {

@@ -118,6 +118,7 @@ pub fn candidates() -> Result<Vec<Recipe>, GuideError> {
         "direction-table": { "kappa": 32.0 },
         "emitter-table": { "kappa": 32.0 },
         "light-table": { "kappa": 32.0 },
+        "ray-table": { "kappa": 32.0 },
     });
     let stiff = stiff.as_object().cloned().unwrap_or_default();
     Ok(vec![
@@ -362,11 +363,8 @@ fn cost_ratio(fixed: f64, guide: &dyn Guide, records: &Records<'_>, remaining: &
     for &decision in guide.models() {
         for (vertex, columns) in records.columns(decision) {
             let mut u: Vec<f32> = (0..rows)
-                .flat_map(|row| {
-                    records.u[row * records.dims..][columns.clone()]
-                        .iter()
-                        .copied()
-                })
+                .flat_map(|row| records.numbers(decision, row, columns.clone()))
+                .copied()
                 .collect();
             let contexts: Vec<Context> = if guide.looks_at_contexts(decision) {
                 (0..rows)
@@ -416,8 +414,10 @@ struct Part {
     f: Vec<f32>,
     f_bsdf: Vec<f32>,
     f_max: Vec<f32>,
+    ray: Vec<[f32; 2]>,
     g: Vec<f32>,
     g_bsdf: Vec<f32>,
+    g_both: Vec<f32>,
     contexts: Vec<Context>,
     pixel: Vec<[f32; 2]>,
     /// Share of all rows that were meant to be picked.
@@ -432,7 +432,9 @@ impl Part {
         self.f_max.push(records.f_max[row]);
         self.g.push(records.g[row]);
         self.f_bsdf.extend(records.f_bsdf.get(row));
+        self.ray.extend(records.ray.get(row));
         self.g_bsdf.extend(records.g_bsdf.get(row));
+        self.g_both.extend(records.g_both.get(row));
         self.contexts.extend(
             records
                 .contexts
@@ -452,7 +454,9 @@ impl Part {
             f_bsdf: &self.f_bsdf,
             f_max: &self.f_max,
             g: &self.g,
+            ray: &self.ray,
             g_bsdf: &self.g_bsdf,
+            g_both: &self.g_both,
             contexts: &self.contexts,
             pixel: &self.pixel,
             emitters,
@@ -487,6 +491,7 @@ pub(crate) fn is_idle(models: &[Decision], records: &Records<'_>) -> bool {
         Decision::Direction => records.bounces() < 2,
         Decision::Emitter => records.emitters.len() < 2,
         Decision::Light => records.emitters.is_empty(),
+        Decision::Ray => records.ray.is_empty() || records.f_bsdf.iter().all(|&f| f == 0.0),
         Decision::Path => false,
     };
     models.iter().all(idle)

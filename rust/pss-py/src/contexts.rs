@@ -89,8 +89,9 @@ pub(crate) fn decision(name: &str) -> PyResult<Decision> {
         "direction" => Ok(Decision::Direction),
         "emitter" => Ok(Decision::Emitter),
         "light" => Ok(Decision::Light),
+        "ray" => Ok(Decision::Ray),
         _ => Err(errors::value(format!(
-            "decision {name:?} is unknown (known: path, direction, emitter, light)"
+            "decision {name:?} is unknown (known: path, direction, emitter, light, ray)"
         ))),
     }
 }
@@ -99,7 +100,7 @@ pub(crate) fn decision(name: &str) -> PyResult<Decision> {
 pub(crate) fn width(decision: Decision, dims: usize) -> usize {
     match decision {
         Decision::Path => dims,
-        Decision::Direction | Decision::Light => 2,
+        Decision::Direction | Decision::Light | Decision::Ray => 2,
         Decision::Emitter => 1,
     }
 }

@@ -29,7 +29,7 @@ impl Guide {
     /// Fits guide `name` to numbers and contributions, and for a guide that looks at vertices to these.
     #[staticmethod]
     #[pyo3(signature = (
-        name, u, f, *, f_max=None, f_bsdf=None, g=None, zeros=0, contexts=None, pixel=None, emitters=Vec::new(),
+        name, u, f, *, f_max=None, f_bsdf=None, ray=None, g=None, zeros=0, contexts=None, pixel=None, emitters=Vec::new(),
         options="{}", seed=0, progress=None
     ))]
     #[allow(clippy::too_many_arguments)]
@@ -40,6 +40,7 @@ impl Guide {
         f: PyReadonlyArray1<'_, f32>,
         f_max: Option<PyReadonlyArray1<'_, f32>>,
         f_bsdf: Option<PyReadonlyArray1<'_, f32>>,
+        ray: Option<PyReadonlyArray2<'_, f32>>,
         g: Option<PyReadonlyArray1<'_, f32>>,
         zeros: u64,
         contexts: Option<Bound<'_, PyDict>>,
@@ -55,6 +56,7 @@ impl Guide {
         let f = arrays::vector(&f);
         let f_max = f_max.map_or_else(|| f.clone(), |a| arrays::vector(&a));
         let f_bsdf = f_bsdf.map_or_else(Vec::new, |a| arrays::vector(&a));
+        let ray = ray.map_or(Ok(Vec::new()), |a| arrays::rows::<2>(&a, "ray"))?;
         let g = g.map_or_else(|| vec![1.0; f.len()], |a| arrays::vector(&a));
         let pixel = pixel.map_or(Ok(Vec::new()), |a| arrays::rows::<2>(&a, "pixel"))?;
         let vertices = f.len() * (dims.saturating_sub(1) / 2);
@@ -75,6 +77,7 @@ impl Guide {
                 f: &f,
                 f_bsdf: &f_bsdf,
                 f_max: &f_max,
+                ray: &ray,
                 g: &g,
                 contexts: &contexts,
                 pixel: &pixel,

@@ -67,7 +67,8 @@ impl Columns {
         self.strategy
     }
 
-    /// Columns that a guide may learn: 2k + 1.
+    /// Columns that a guide of the whole path learns: 2k + 1. The two of the BSDF ray, where there is one, are a decision
+    /// of their own.
     pub fn learned(&self) -> usize {
         2 * self.k + 1
     }
@@ -113,8 +114,8 @@ impl Columns {
 
     /// Hash of the learned columns' meaning (hex), stored in every saved guide.
     ///
-    /// The strategy is not part of it: the two numbers of the BSDF ray are not learned. The
-    /// parametrisation is, since it changes what a direction's numbers mean.
+    /// The strategy is not part of it: what is learned of the BSDF ray is not asked for where there is none, and its two
+    /// numbers mean the same everywhere. The parametrisation is, since it changes what a direction's numbers mean.
     pub fn hash(&self, parametrisation: &str) -> String {
         let mut hasher = blake3::Hasher::new();
         hasher.update(b"pssflow columns 1\n");

@@ -146,6 +146,10 @@ impl<'a> Tracer<'a> {
 
         // ---------------- x_k → light: BSDF-sampled ray ----------------
         if self.columns.strategy() == EmitterStrategy::Mis {
+            self.ask(paths, numbers, Decision::BsdfRay);
+            for (q, q_ray) in paths.q_bsdf.iter_mut().zip(&paths.q_ray) {
+                *q *= q_ray;
+            }
             self.bsdf_rays(paths);
         }
         Self::drop_non_finite(paths);
@@ -176,7 +180,11 @@ impl<'a> Tracer<'a> {
                 u: &mut paths.u,
                 width: self.columns.width(),
                 columns: self.columns.range(decision),
-                q: &mut paths.q_nee,
+                // The ray's numbers are no business of next-event estimation.
+                q: match decision {
+                    Decision::BsdfRay => &mut paths.q_ray,
+                    _ => &mut paths.q_nee,
+                },
             },
         );
     }

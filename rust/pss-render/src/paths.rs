@@ -26,6 +26,8 @@ pub struct Paths {
     pub q_nee: Vec<f32>,
     /// Out: density of the numbers that `f_bsdf` uses.
     pub q_bsdf: Vec<f32>,
+    /// Out: the ray's part of `q_bsdf`, so that q_nee·q_ray is the density of all numbers.
+    pub q_ray: Vec<f32>,
     /// Out: whether x₁ … x_k all exist.
     pub found: Vec<bool>,
     /// Out, if `record`: contexts of x₁ … x_k, k a path; default where a vertex does not exist.
@@ -117,6 +119,7 @@ impl Paths {
             f_bsdf: Vec::new(),
             q_nee: Vec::new(),
             q_bsdf: Vec::new(),
+            q_ray: Vec::new(),
             found: Vec::new(),
             contexts: Vec::new(),
             record: false,
@@ -206,6 +209,8 @@ impl Paths {
         self.q_nee.resize(n, 1.0);
         self.q_bsdf.clear();
         self.q_bsdf.resize(n, 1.0);
+        self.q_ray.clear();
+        self.q_ray.resize(n, 1.0);
         self.found.clear();
         self.found.resize(n, false);
         self.active.clear();

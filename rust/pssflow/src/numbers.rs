@@ -91,28 +91,28 @@ pub(crate) fn context(c: &VertexContext) -> Context {
     }
 }
 
-/// The guides' name of a decision; `None` for the one that is not learned, whose density stays 1.
-fn guides_name(decision: Decision) -> Option<GuideDecision> {
+/// The guides' name of a decision.
+fn guides_name(decision: Decision) -> GuideDecision {
     match decision {
-        Decision::Path => Some(GuideDecision::Path),
-        Decision::Direction(_) => Some(GuideDecision::Direction),
-        Decision::Emitter => Some(GuideDecision::Emitter),
-        Decision::Light => Some(GuideDecision::Light),
-        Decision::BsdfRay => None,
+        Decision::Path => GuideDecision::Path,
+        Decision::Direction(_) => GuideDecision::Direction,
+        Decision::Emitter => GuideDecision::Emitter,
+        Decision::Light => GuideDecision::Light,
+        Decision::BsdfRay => GuideDecision::Ray,
     }
 }
 
 impl NumberSource for GuidedNumbers<'_> {
     fn decide(&mut self, decision: Decision, mut lanes: Lanes<'_>) {
-        let modelled = |d: &GuideDecision| self.guide.models().contains(d);
-        if let Some(decision) = guides_name(decision).filter(modelled) {
+        let decision = guides_name(decision);
+        if self.guide.models().contains(&decision) {
             self.ask(decision, &mut lanes, true);
             self.ask(decision, &mut lanes, false);
         }
     }
 
     fn looks_at(&self, decision: Decision) -> bool {
-        guides_name(decision)
-            .is_some_and(|d| self.guide.models().contains(&d) && self.guide.looks_at_contexts(d))
+        let decision = guides_name(decision);
+        self.guide.models().contains(&decision) && self.guide.looks_at_contexts(decision)
     }
 }

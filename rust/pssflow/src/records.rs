@@ -15,8 +15,11 @@ pub(crate) struct PathRecords {
     f: Vec<f32>,
     f_bsdf: Vec<f32>,
     f_max: Vec<f32>,
+    /// Empty where there is no such ray.
+    ray: Vec<[f32; 2]>,
     g: Vec<f32>,
     g_bsdf: Vec<f32>,
+    g_both: Vec<f32>,
     contexts: Vec<Context>,
     pixel: Vec<[f32; 2]>,
     /// Paths that these were taken from, with and without light.
@@ -45,12 +48,16 @@ impl PathRecords {
         pixel: [f32; 2],
     ) {
         let f = paths.f(i);
-        self.u.extend_from_slice(&paths.u[i * width..][..learned]);
+        let (u, ray) = paths.u[i * width..][..width].split_at(learned);
+        self.u.extend_from_slice(u);
+        self.ray.extend(ray.as_chunks().0);
         self.f.push(luminance(f));
         self.f_bsdf.push(luminance(paths.f_bsdf[i]));
         self.f_max.push(f.max_element());
         self.g.push(mixture.density(paths.q_nee[i]) * kept);
         self.g_bsdf.push(mixture.density(paths.q_bsdf[i]) * kept);
+        let both = paths.q_nee[i] * paths.q_ray[i];
+        self.g_both.push(mixture.density(both) * kept);
         self.pixel.push(pixel);
         if paths.record {
             let k = learned / 2;
@@ -69,6 +76,7 @@ impl PathRecords {
         let vertices = if contexts { more * (width / 2) } else { 0 };
         // Where there is none, they find theirs as they come.
         let _ = self.u.try_reserve_exact(more * width);
+        let _ = self.ray.try_reserve_exact(more);
         for numbers in self.numbers() {
             let _ = numbers.try_reserve_exact(more);
         }
@@ -91,7 +99,7 @@ impl PathRecords {
             let at = (row - parts[i].start) as u64;
             (at + 1) * kept[i] / sizes[i] > at * kept[i] / sizes[i]
         };
-        for density in [&mut self.g, &mut self.g_bsdf] {
+        for density in [&mut self.g, &mut self.g_bsdf, &mut self.g_both] {
             for (part, (kept, size)) in parts.iter().zip(kept.iter().zip(sizes)) {
                 let share = *kept as f32 / size as f32;
                 density[part.clone()].iter_mut().for_each(|g| *g *= share);
@@ -101,17 +109,19 @@ impl PathRecords {
             keep(numbers, all, stays);
         }
         keep(&mut self.u, all, stays);
+        keep(&mut self.ray, all, stays);
         keep(&mut self.contexts, all, stays);
         keep(&mut self.pixel, all, stays);
     }
 
-    fn numbers(&mut self) -> [&mut Vec<f32>; 5] {
+    fn numbers(&mut self) -> [&mut Vec<f32>; 6] {
         [
             &mut self.f,
             &mut self.f_bsdf,
             &mut self.f_max,
             &mut self.g,
             &mut self.g_bsdf,
+            &mut self.g_both,
         ]
     }
 
@@ -121,7 +131,9 @@ impl PathRecords {
         self.f_bsdf.append(&mut other.f_bsdf);
         self.f_max.append(&mut other.f_max);
         self.g.append(&mut other.g);
+        self.ray.append(&mut other.ray);
         self.g_bsdf.append(&mut other.g_bsdf);
+        self.g_both.append(&mut other.g_both);
         self.contexts.append(&mut other.contexts);
         self.pixel.append(&mut other.pixel);
         self.drawn += other.drawn;
@@ -136,7 +148,9 @@ impl PathRecords {
             f_bsdf: &self.f_bsdf,
             f_max: &self.f_max,
             g: &self.g,
+            ray: &self.ray,
             g_bsdf: &self.g_bsdf,
+            g_both: &self.g_both,
             contexts: &self.contexts,
             pixel: &self.pixel,
             emitters,
@@ -170,7 +184,9 @@ mod tests {
             f_bsdf: values().collect(),
             f_max: values().collect(),
             g: vec![1.0; paths.into()],
+            ray: values().map(|x| [x, -x]).collect(),
             g_bsdf: vec![2.0; paths.into()],
+            g_both: vec![4.0; paths.into()],
             contexts: Vec::new(),
             pixel: values().map(|x| [x, x]).collect(),
             drawn: 4000,
@@ -184,6 +200,8 @@ mod tests {
         assert!(records.f[49] < 400.0 && records.f[50] >= 400.0);
         for (i, &x) in records.f.iter().enumerate() {
             assert_eq!(records.g_bsdf[i], 2.0 * records.g[i]);
+            assert_eq!(records.g_both[i], 4.0 * records.g[i]);
+            assert_eq!(records.ray[i], [x, -x]);
             assert_eq!(records.u[2 * i..2 * i + 2], [x, -x]);
             assert_eq!(records.pixel[i], [x, x]);
         }

@@ -40,6 +40,8 @@ pub(crate) enum Kind {
     Emitter,
     /// The light's pair.
     Light,
+    /// The pair of the BSDF-sampled ray at x_k.
+    Ray,
 }
 
 impl Kind {
@@ -49,6 +51,7 @@ impl Kind {
             Self::Direction => "direction-table",
             Self::Emitter => "emitter-table",
             Self::Light => "light-table",
+            Self::Ray => "ray-table",
         }
     }
 
@@ -57,6 +60,7 @@ impl Kind {
             Self::Direction => &[Decision::Direction],
             Self::Emitter => &[Decision::Emitter],
             Self::Light => &[Decision::Light],
+            Self::Ray => &[Decision::Ray],
         }
     }
 
@@ -89,8 +93,8 @@ impl Kind {
 /// The tables of each kind.
 #[derive(Debug)]
 enum Tables {
-    /// Groups are bounces.
-    Direction(Bank<Squares>),
+    /// Of a pair at a vertex; groups are bounces.
+    Vertex(Bank<Squares>),
     Emitter(Bank<Lines>),
     /// Groups are emitters.
     Light {
@@ -112,7 +116,7 @@ pub(crate) struct TableGuide {
 }
 
 impl TableGuide {
-    /// Fits a table; the `fit` of three registry lines. No number is drawn.
+    /// Fits a table; the `fit` of its registry lines. No number is drawn.
     pub(crate) fn fit(
         kind: Kind,
         given: &Map<String, Value>,
@@ -142,10 +146,10 @@ impl TableGuide {
         let pair = |square: Square| move |u: &[f32]| square.leaf([u[0], u[1]]);
         let mut rest = |done: f32| progress(0.25 + 0.74 * done);
         let tables = match kind {
-            Kind::Direction => {
+            Kind::Direction | Kind::Ray => {
                 let square = square(options.bins(paths));
                 let examples = examples(&pair(square));
-                Bank::<Squares>::fit(square, plan, &examples, &mut rest).map(Tables::Direction)
+                Bank::<Squares>::fit(square, plan, &examples, &mut rest).map(Tables::Vertex)
             }
             Kind::Emitter => {
                 let mut examples = examples(&|u| line.leaf(u[0]));
@@ -223,8 +227,8 @@ impl TableGuide {
         let dims = number(&config["dims"], "dims")?;
         let bins = |i: usize| number(&config["bins"][i], "bins");
         let tables = match kind {
-            Kind::Direction => {
-                Tables::Direction(Bank::<Squares>::restore("", bins(0)?, &mut contents)?)
+            Kind::Direction | Kind::Ray => {
+                Tables::Vertex(Bank::<Squares>::restore("", bins(0)?, &mut contents)?)
             }
             Kind::Emitter => Tables::Emitter(Bank::<Lines>::restore("", &mut contents)?),
             Kind::Light => Tables::Light {
@@ -268,7 +272,7 @@ impl TableGuide {
             )
         };
         match &self.tables {
-            Tables::Direction(bank) => squares(&[bank]),
+            Tables::Vertex(bank) => squares(&[bank]),
             Tables::Light {
                 area, environment, ..
             } => squares(&[area, environment]),
@@ -310,7 +314,7 @@ impl Guide for TableGuide {
             return q.fill(1.0);
         }
         match &self.tables {
-            Tables::Direction(bank) => {
+            Tables::Vertex(bank) => {
                 let (pairs, _) = u.as_chunks_mut::<2>();
                 Self::each(contexts, pairs.iter_mut(), q, |c, u| {
                     bank.sample(c.bounce, c, u)
@@ -340,7 +344,7 @@ impl Guide for TableGuide {
             return q.fill(1.0);
         }
         match &self.tables {
-            Tables::Direction(bank) => {
+            Tables::Vertex(bank) => {
                 let (pairs, _) = u.as_chunks::<2>();
                 Self::each(contexts, pairs.iter(), q, |c, u| {
                     bank.density(c.bounce, c, u)
@@ -368,7 +372,7 @@ impl Guide for TableGuide {
     fn cell(&self, decision: Decision, context: &Context) -> Option<usize> {
         match &self.tables {
             _ if !self.models().contains(&decision) => None,
-            Tables::Direction(bank) => bank.find(context.bounce, context),
+            Tables::Vertex(bank) => bank.find(context.bounce, context),
             Tables::Emitter(bank) => bank.find(0, context),
             Tables::Light {
                 area,
@@ -411,7 +415,7 @@ impl Guide for TableGuide {
             ..Contents::default()
         };
         match &self.tables {
-            Tables::Direction(bank) => {
+            Tables::Vertex(bank) => {
                 contents.config["bins"] = json!([bank.tables.bins]);
                 bank.put("", &mut contents);
             }
@@ -445,6 +449,7 @@ impl Weighted {
             match kind {
                 Kind::Direction => terms.square(),
                 Kind::Emitter | Kind::Light => terms.nee_square(),
+                Kind::Ray => terms.bsdf_square(),
             }
         };
         let clipped = Clipped::new(usable.iter().copied(), weight, clip);
@@ -466,10 +471,10 @@ impl Weighted {
         for (vertex, columns) in records.columns(kind.models()[0]) {
             let example = |&(row, weight): &(usize, f32)| {
                 let context = records.context(row, vertex);
-                let u = &records.u[row * records.dims..][columns.clone()];
+                let u = records.numbers(kind.models()[0], row, columns.clone());
                 Example {
                     group: match kind {
-                        Kind::Direction => context.bounce,
+                        Kind::Direction | Kind::Ray => context.bounce,
                         Kind::Emitter => 0,
                         Kind::Light => context.emitter,
                     },

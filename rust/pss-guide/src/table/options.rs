@@ -7,7 +7,7 @@ use super::cells::MOST_DEPTH;
 use super::square::Square;
 use crate::{GuideError, options};
 
-/// Options of `direction-table` and `light-table`. What is `null` follows the number of pilot paths.
+/// Options of `direction-table`, `light-table` and `ray-table`. What is `null` follows the number of pilot paths.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TableOptions {

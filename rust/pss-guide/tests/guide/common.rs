@@ -163,7 +163,7 @@ pub(crate) fn cases(guide: &dyn Guide) -> Vec<Case> {
         let width = match decision {
             Decision::Path => guide.dims(),
             Decision::Emitter => 1,
-            Decision::Direction | Decision::Light => 2,
+            Decision::Direction | Decision::Light | Decision::Ray => 2,
         };
         let case = |place| Case {
             decision,

@@ -134,6 +134,7 @@ fn decisions_that_a_guide_does_not_model_stay_uniform() {
         Decision::Direction,
         Decision::Emitter,
         Decision::Light,
+        Decision::Ray,
     ];
     for spec in registry() {
         let guide = &fit_small(spec.name, 5).guide;

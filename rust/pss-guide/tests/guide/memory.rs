@@ -115,7 +115,7 @@ fn memory_is_bounded_and_the_rarest_cells_give_way() {
         for (i, c) in paths.contexts.iter_mut().enumerate() {
             c.position = bend(i, c.position);
         }
-        for name in ["direction-table", "emitter-table", "light-table"] {
+        for name in ["direction-table", "emitter-table", "light-table", "ray-table"] {
             let what = format!("{name}, {scene}");
             let facts = |given| {
                 let guide = fitted(name, &given, &paths);
@@ -169,5 +169,5 @@ fn the_factors_of_a_composite_share_their_memory() {
             .as_u64()
             .unwrap()
     };
-    assert_eq!((mib(0), mib(2)), (192, 1));
+    assert_eq!((mib(0), mib(2)), (160, 1));
 }

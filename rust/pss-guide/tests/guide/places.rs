@@ -9,8 +9,8 @@ use crate::world::{Paths, World};
 /// Guides of every decision: one for each that models directions by place.
 pub(crate) const ALL: [&str; 3] = [
     "table",
-    "mixture-net+emitter-table+light-table",
-    "spline-net+emitter-table+light-table",
+    "mixture-net+emitter-table+light-table+ray-table",
+    "spline-net+emitter-table+light-table+ray-table",
 ];
 
 fn fitted(name: &str, paths: &Paths) -> Box<dyn Guide> {
@@ -63,7 +63,8 @@ fn each_guide_gains_alone_and_more_bounces_gain_more() {
         ("mixture-net", 2.0),
         ("spline-net", 2.0),
         ("emitter-table", 1.15),
-        ("light-table", 1.3),
+        ("light-table", 1.15),
+        ("ray-table", 1.15),
         ("table", 8.0),
     ] {
         let guide = fit(name, &Map::new(), &paths.records(), 1, &mut |_| true)
@@ -117,8 +118,10 @@ fn few_paths_and_poor_ones_make_a_sound_guide() {
             u: all.u[..n * 5].to_vec(),
             f: all.f[..n].to_vec(),
             f_bsdf: all.f_bsdf[..n].to_vec(),
+            ray: all.ray[..n].to_vec(),
             g: all.g[..n].to_vec(),
             g_bsdf: all.g_bsdf[..n].to_vec(),
+            g_both: all.g_both[..n].to_vec(),
             contexts: all.contexts[..n * 2].to_vec(),
             pixel: all.pixel[..n].to_vec(),
             zeros: 100,
@@ -145,6 +148,7 @@ fn few_paths_and_poor_ones_make_a_sound_guide() {
         poor.g_bsdf[4],
         poor.u[25],
     ) = (f32::NAN, 0.0, f32::INFINITY, f32::NAN, 1.0);
+    (poor.g_both[6], poor.ray[7]) = (0.0, [0.5, f32::NAN]);
     poor.contexts[20].position = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY];
     poor.contexts[22].normal = [f32::NAN; 3];
     (poor.f[50], poor.f[51]) = (f32::MAX, 1e-38);
@@ -163,6 +167,8 @@ fn few_paths_and_poor_ones_make_a_sound_guide() {
     check(&one, "no places");
     one.f_bsdf.clone_from(&one.f);
     check(&one, "no light from emitters that are chosen");
+    one.ray.clear();
+    check(&one, "no BSDF-sampled ray");
 }
 
 /// Whether densities at several places integrate to one, and samples stay in the cube.

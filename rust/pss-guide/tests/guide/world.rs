@@ -35,8 +35,10 @@ pub(crate) struct Paths {
     pub(crate) u: Vec<f32>,
     pub(crate) f: Vec<f32>,
     pub(crate) f_bsdf: Vec<f32>,
+    pub(crate) ray: Vec<[f32; 2]>,
     pub(crate) g: Vec<f32>,
     pub(crate) g_bsdf: Vec<f32>,
+    pub(crate) g_both: Vec<f32>,
     pub(crate) contexts: Vec<Context>,
     pub(crate) pixel: Vec<[f32; 2]>,
     pub(crate) zeros: u64,
@@ -51,7 +53,9 @@ impl Paths {
             f_bsdf: &self.f_bsdf,
             f_max: &self.f,
             g: &self.g,
+            ray: &self.ray,
             g_bsdf: &self.g_bsdf,
+            g_both: &self.g_both,
             contexts: &self.contexts,
             pixel: &self.pixel,
             emitters: &EMITTERS,
@@ -86,7 +90,7 @@ impl World {
     }
 
     /// Both terms of f.
-    fn terms(&self, u: &[f32], contexts: &[Context]) -> (f32, f32) {
+    fn terms(&self, u: &[f32], ray: [f32; 2], contexts: &[Context]) -> (f32, f32) {
         if self.flat {
             return (1.0, 0.2);
         }
@@ -115,7 +119,12 @@ impl World {
         };
         let light = &u[2 * self.k - 1..];
         let on_light = bump(light[0], 0.2 + 0.15 * e) * bump(light[1], 0.2 + tilt);
-        (40.0 * directions * near * on_light, 0.05 * directions)
+        let meets =
+            bump(ray[0], 0.8 - 0.6 * place(last)[1]) * bump(ray[1], (side(last) + 0.5) / 6.0);
+        (
+            40.0 * directions * near * on_light,
+            20.0 * directions * meets,
+        )
     }
 
     /// `n` paths from m = a + (1 − a) q, or uniform ones.
@@ -124,7 +133,7 @@ impl World {
         let mut numbers = Stream::new(77, Purpose::Test).sequence(stream, k as u32);
         let mut u = vec![0.0f32; n * dims];
         let mut contexts = Vec::with_capacity(n * k);
-        let mut uniform = Vec::with_capacity(n);
+        let (mut uniform, mut rays) = (Vec::with_capacity(n), Vec::with_capacity(2 * n));
         for row in u.chunks_exact_mut(dims) {
             for b in 1..=k {
                 let four = std::array::from_fn(|_| numbers.next_f32());
@@ -132,8 +141,9 @@ impl World {
             }
             row.fill_with(|| numbers.next_f32());
             uniform.push(numbers.next_f32());
+            rays.extend([(); 2].map(|()| numbers.next_f32()));
         }
-        let (mut q, mut q_bsdf) = (vec![1.0f32; n], vec![1.0f32; n]);
+        let mut q = [(); 3].map(|()| vec![1.0f32; n]);
         let mut paths = Paths {
             dims,
             pixel: contexts.chunks_exact(k).map(|c| c[0].pixel).collect(),
@@ -143,7 +153,11 @@ impl World {
             let last = vertex + 1 == k;
             let at = 2 * vertex;
             let steps = if last {
-                vec![(Decision::Emitter, at, 1), (Decision::Light, at + 1, 2)]
+                vec![
+                    (Decision::Emitter, at, 1),
+                    (Decision::Light, at + 1, 2),
+                    (Decision::Ray, 0, 2),
+                ]
             } else {
                 vec![(Decision::Direction, at, 2)]
             };
@@ -155,7 +169,11 @@ impl World {
                 }
                 let Some((guide, a)) = guide else { continue };
                 let here: Vec<Context> = contexts.chunks_exact(k).map(|c| c[vertex]).collect();
-                let own = u.chunks_exact(dims).flat_map(|u| &u[at..at + width]);
+                let (of, stride) = match decision {
+                    Decision::Ray => (&mut rays, 2),
+                    _ => (&mut u, dims),
+                };
+                let own = of.chunks_exact(stride).flat_map(|u| &u[at..at + width]);
                 let mut own: Vec<f32> = own.copied().collect();
                 let (before, mut each) = (own.clone(), vec![1.0; n]);
                 guide.sample(decision, &here, &mut own, &mut each);
@@ -167,19 +185,26 @@ impl World {
                 }
                 guide.density(decision, &here, &own, &mut each);
                 for row in 0..n {
-                    u[row * dims + at..][..width].copy_from_slice(&own[row * width..][..width]);
-                    q[row] *= each[row];
-                    if decision == Decision::Direction {
-                        q_bsdf[row] *= each[row];
+                    of[row * stride + at..][..width].copy_from_slice(&own[row * width..][..width]);
+                    // f_nee's numbers, f_bsdf's, and all.
+                    let uses = match decision {
+                        Decision::Ray => [false, true, true],
+                        Decision::Direction => [true; 3],
+                        _ => [true, false, true],
+                    };
+                    for (q, _) in q.iter_mut().zip(uses).filter(|q| q.1) {
+                        q[row] *= each[row];
                     }
                 }
             }
         }
         let a = guide.map_or(1.0, |g| g.1);
         let mixed = |q: Vec<f32>| -> Vec<f32> { q.iter().map(|q| a + (1.0 - a) * q).collect() };
-        (paths.g, paths.g_bsdf) = (mixed(q), mixed(q_bsdf));
-        for (u, c) in u.chunks_exact(dims).zip(contexts.chunks_exact(k)) {
-            let (nee, bsdf) = self.terms(u, c);
+        [paths.g, paths.g_bsdf, paths.g_both] = q.map(mixed);
+        paths.ray = rays.as_chunks().0.to_vec();
+        let rows = u.chunks_exact(dims).zip(contexts.chunks_exact(k));
+        for ((u, c), ray) in rows.zip(&paths.ray) {
+            let (nee, bsdf) = self.terms(u, *ray, c);
             paths.f.push(nee + bsdf);
             paths.f_bsdf.push(bsdf);
         }
