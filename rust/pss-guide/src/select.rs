@@ -109,7 +109,7 @@ pub struct Selection {
 
 /// The candidates of `auto`; every subset of a composite's factors is meant, too.
 ///
-/// `mixture-net` and `spline-net` are none yet (ARCHITECTURE.md).
+/// `mixture-net` and `spline-net` are none: in equal time they lose (ARCHITECTURE.md).
 ///
 /// # Errors
 /// None that the registry of this build does not cause.

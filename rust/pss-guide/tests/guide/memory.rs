@@ -115,7 +115,12 @@ fn memory_is_bounded_and_the_rarest_cells_give_way() {
         for (i, c) in paths.contexts.iter_mut().enumerate() {
             c.position = bend(i, c.position);
         }
-        for name in ["direction-table", "emitter-table", "light-table", "ray-table"] {
+        for name in [
+            "direction-table",
+            "emitter-table",
+            "light-table",
+            "ray-table",
+        ] {
             let what = format!("{name}, {scene}");
             let facts = |given| {
                 let guide = fitted(name, &given, &paths);

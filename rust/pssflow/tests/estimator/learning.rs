@@ -13,7 +13,8 @@ use crate::common::furnace;
 
 const BINS: usize = 3;
 
-/// A histogram of f²/g over the two numbers at x₁, by the side of x = 0 that x₁ lies on.
+/// A histogram of f²/g over the two numbers at x₁, by the side of x = 0 that x₁ lies on. The first number of the
+/// BSDF-sampled ray has the density 2u, whatever is learned: far from one, so that a wrong division shows.
 #[derive(Debug)]
 struct Halves([[f32; BINS * BINS]; 2]);
 
@@ -51,14 +52,20 @@ impl Guide for Halves {
     }
 
     fn models(&self) -> &[Decision] {
-        &[Decision::Direction]
+        &[Decision::Direction, Decision::Ray]
     }
 
     fn dims(&self) -> usize {
         5
     }
 
-    fn sample(&self, _: Decision, contexts: &[Context], u: &mut [f32], q: &mut [f32]) {
+    fn sample(&self, decision: Decision, contexts: &[Context], u: &mut [f32], q: &mut [f32]) {
+        if decision == Decision::Ray {
+            for u in u.chunks_exact_mut(2) {
+                u[0] = u[0].sqrt().min(1.0 - f32::EPSILON / 2.0);
+            }
+            return self.density(decision, contexts, u, q);
+        }
         let pairs = u.chunks_exact_mut(2).zip(contexts).zip(q);
         for ((u, context), q) in pairs {
             let table = &self.0[side(context)];
@@ -75,7 +82,14 @@ impl Guide for Halves {
         }
     }
 
-    fn density(&self, _: Decision, contexts: &[Context], u: &[f32], q: &mut [f32]) {
+    fn density(&self, decision: Decision, contexts: &[Context], u: &[f32], q: &mut [f32]) {
+        if decision == Decision::Ray {
+            assert!(contexts.iter().all(|c| c.bounce == 2));
+            return q
+                .iter_mut()
+                .zip(u.chunks_exact(2))
+                .for_each(|(q, u)| *q = 2.0 * u[0]);
+        }
         for ((u, context), q) in u.chunks_exact(2).zip(contexts).zip(q) {
             *q = self.0[side(context)][bin(u)];
         }
@@ -94,10 +108,13 @@ impl Guide for Halves {
     }
 }
 
-/// Learns [`Halves`], and notes how many paths it was given and their mean.
+/// Learns [`Halves`], and notes how many paths it was given and their mean, each term by the density of its own numbers and
+/// both by that of all.
 #[derive(Default)]
 struct Learns {
-    seen: Mutex<Vec<(u64, f64)>>,
+    seen: Mutex<Vec<(u64, [f64; 2])>>,
+    /// Calls that are answered with "too few paths" first.
+    refusals: Mutex<u32>,
 }
 
 impl Learner for Learns {
@@ -123,14 +140,25 @@ impl Learner for Learns {
         _seed: u64,
         _progress: &mut dyn FnMut(f32) -> bool,
     ) -> Result<Fit, GuideError> {
+        let mut refusals = self.refusals.lock().unwrap();
+        if *refusals > 0 {
+            *refusals -= 1;
+            return Err(GuideError::TooFewPaths {
+                usable: 0,
+                given: records.f.len(),
+                nonfinite: 0,
+                zeros: records.zeros,
+            });
+        }
         let drawn = records.f.len() as u64 + records.zeros;
-        let terms = (0..records.f.len()).map(|r| {
-            let bsdf = f64::from(records.f_bsdf[r]);
-            (f64::from(records.f[r]) - bsdf) / f64::from(records.g[r])
-                + bsdf / f64::from(records.g_bsdf[r])
-        });
-        let mean = terms.sum::<f64>() / drawn as f64;
-        self.seen.lock().unwrap().push((drawn, mean));
+        let mut means = [0.0; 2];
+        for r in 0..records.f.len() {
+            let (f, bsdf) = (f64::from(records.f[r]), f64::from(records.f_bsdf[r]));
+            let (g, g_bsdf) = (f64::from(records.g[r]), f64::from(records.g_bsdf[r]));
+            means[0] += ((f - bsdf) / g + bsdf / g_bsdf) / drawn as f64;
+            means[1] += f / f64::from(records.g_both[r]) / drawn as f64;
+        }
+        self.seen.lock().unwrap().push((drawn, means));
         Ok(Fit {
             guide: Box::new(Halves::fit(records)),
             history: Vec::new(),
@@ -257,9 +285,34 @@ fn records_of_all_passes_have_one_mean() {
     let seen = learner.seen.lock().unwrap();
     let drawn: Vec<u64> = seen.iter().map(|s| s.0).collect();
     assert_eq!(drawn, [1024, 2048, 4096, 8192, 16384]);
-    for (_, mean) in &*seen {
-        assert!((mean - 0.25).abs() < 0.03, "{mean}");
+    for (_, means) in &*seen {
+        for mean in means {
+            assert!((mean - 0.25).abs() < 0.03, "{means:?}");
+        }
     }
+}
+
+/// What was too little to learn from at first need not stay so, and then nobody is told of it.
+#[test]
+fn a_reason_does_not_outlive_its_cause() {
+    let scene = furnace(8);
+    let rendered = |refusals| {
+        let learner = Learns {
+            refusals: Mutex::new(refusals),
+            ..Learns::default()
+        };
+        let choice = GuideChoice::Learn(Arc::new(learner));
+        render(&scene, &options(choice, Budget::Spp(64)), &Silent).unwrap()
+    };
+    let late = rendered(1);
+    assert_eq!((late.chosen.as_str(), late.notes.len()), ("halves", 0));
+    let never = rendered(u32::MAX);
+    assert_eq!(never.chosen, "none");
+    assert!(
+        never.notes.iter().any(|n| n.ends_with("none is used")),
+        "{:?}",
+        never.notes
+    );
 }
 
 #[test]

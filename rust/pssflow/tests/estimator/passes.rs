@@ -118,6 +118,35 @@ fn a_plan_without_a_guide_keeps_its_pilot_at_half_its_weight() {
     assert_eq!(replayed.film.found, [8]);
 }
 
+/// Claim: the variance that is told is the images' own, also where samples count half; as if all counted the same it would be
+/// 10 % less.
+#[test]
+fn the_pilots_weight_is_in_the_variance() {
+    let scene = furnace(4);
+    let plan = vec![pass(PassKind::Pilot, 8), pass(PassKind::Uniform, 8)];
+    let (renders, pixels) = (1000, 3 * 16);
+    let (mut told, mut sum, mut squares) = (0.0, vec![0.0; pixels], vec![0.0; pixels]);
+    for seed in 0..renders {
+        let options = Options {
+            seed,
+            budget: Budget::Replay(plan.clone()),
+            threads: 1,
+            ..Options::default()
+        };
+        let film = render(&scene, &options, &Silent).unwrap().film;
+        told += film.variance.iter().map(|&v| f64::from(v)).sum::<f64>();
+        for (i, &x) in film.image.iter().enumerate() {
+            sum[i] += f64::from(x);
+            squares[i] += f64::from(x) * f64::from(x);
+        }
+    }
+    let n = renders as f64;
+    let each = sum.iter().zip(&squares);
+    let between: f64 = each.map(|(s, q)| (q - s * s / n) / (n - 1.0)).sum();
+    let ratio = told / n / between;
+    assert!((ratio - 1.0).abs() < 0.05, "{ratio}");
+}
+
 #[test]
 fn a_path_that_is_not_finite_carries_no_light_in_any_count() {
     let scene = furnace(1);
