@@ -16,9 +16,9 @@ const DISAGREEMENT_ERRORS: f64 = 2.0;
 /// Standard errors between the means of pilot and guided paths that are told.
 const MEAN_ERRORS: f64 = 4.0;
 
-/// Share of all light in a single path that is told, if at least so many paths carry light.
+/// Share of all light in a single path that is told, if there are at least so many paths.
 const ONE_PATH: f64 = 0.1;
-const ENOUGH_PATHS: u64 = 100;
+const ENOUGH_PATHS: u64 = 1000;
 
 /// Share of the pixels whose energy is told: the brightest ones.
 const BRIGHTEST: f64 = 0.001;
@@ -179,7 +179,7 @@ impl Diagnostics {
             brightest_pixels,
             warnings: Vec::new(),
         };
-        found.warnings = found.worries(all.counts.nonzero);
+        found.warnings = found.worries(all.counts.camera_rays);
         found
     }
 
@@ -188,7 +188,7 @@ impl Diagnostics {
         (self.brightest_share, self.brightest_pixels) = brightest(film);
     }
 
-    fn worries(&self, nonzero: u64) -> Vec<String> {
+    fn worries(&self, paths: u64) -> Vec<String> {
         let mut worries = Vec::new();
         if let Some(k) = self.pareto_k.filter(|k| *k > HEAVY_TAIL) {
             worries.push(format!(
@@ -211,7 +211,7 @@ impl Diagnostics {
                 means.z
             ));
         }
-        if self.largest_share > ONE_PATH && nonzero >= ENOUGH_PATHS {
+        if self.largest_share > ONE_PATH && paths >= ENOUGH_PATHS {
             worries.push(format!(
                 "a single path carries {:.0} % of all light: the variance estimate is not to be trusted",
                 100.0 * self.largest_share
