@@ -215,7 +215,7 @@ impl Run<'_> {
         } else {
             0.0
         };
-        let older = self.records.len();
+        let mut older = self.records.len();
         if record > 0.0 {
             self.reserve_records();
         }
@@ -241,6 +241,8 @@ impl Run<'_> {
         self.apart.extend(own.filter(|_| !discarded));
         if record > 0.0 {
             self.records.count(statistics.counts.camera_rays);
+            // Where memory ran out, older ones gave way.
+            older = older.min(self.records.len());
             let newer = self.records.len() - older;
             let rest = self.options.max_records.saturating_sub(newer);
             self.records.thin(older, [rest, newer]);
@@ -332,6 +334,9 @@ impl Run<'_> {
             _ => {}
         }
         notes.extend(self.current.diverged.clone());
+        if self.pilot.short_of_memory || self.rendered.short_of_memory {
+            notes.push("memory was short: fewer paths were kept to learn from".to_owned());
+        }
         let [width, height] = scene.film().crop_size();
         let mut all = self.pilot.counts;
         all.add(&self.rendered.counts);

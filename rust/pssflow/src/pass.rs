@@ -109,7 +109,7 @@ impl PassContext<'_> {
     ) -> Result<Statistics, RenderError> {
         let pieces = self.pieces(pass);
         let mut total = Statistics::default();
-        let (mut pass, older) = (*pass, records.len());
+        let (mut pass, mut older) = (*pass, records.len());
         let (start, end) = pass.span;
         for (batch, work) in pieces.chunks(BATCH).enumerate() {
             let done: Vec<Option<Piece>> = self.pool.install(|| {
@@ -125,7 +125,11 @@ impl PassContext<'_> {
                 };
                 image.merge_weighted(&piece.sums, |_, _| pass.weight);
                 total.add(&piece.statistics);
-                records.append(&mut piece.records);
+                if !records.append(&mut piece.records, &mut older) {
+                    pass.record *= 0.5;
+                    pass.most_records = pass.most_records.min(records.len());
+                    total.short_of_memory = true;
+                }
             }
             while records.len() - older > pass.most_records {
                 records.thin(older, [older, (records.len() - older) / 2]);
