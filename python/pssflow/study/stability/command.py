@@ -145,9 +145,7 @@ def _sources() -> str:
     return hashlib.sha256(b"".join(texts)).hexdigest()[:16]
 
 
-def _examine(
-    case: Case, guide: str, effort: Effort, benches: dict[str, Bench]
-) -> Finding | None:
+def _examine(case: Case, guide: str, effort: Effort, benches: dict[str, Bench]) -> Finding | None:
     from .measure import measure
 
     if case.settings:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +28,8 @@ PRIOR = Case(
     1,
     "prior-without-support",
     "A prior without full support",
-    "With a uniform prior on the cube, whatever the flow carries outside has density zero: its logarithm has no gradient, "
-    "and paths that it should draw are never drawn again.",
+    "With a uniform prior on the cube, whatever the flow carries outside has density zero: its logarithm has no "
+    "gradient, and paths that it should draw are never drawn again.",
     (
         Setting(
             "hypercube prior",
@@ -73,7 +73,8 @@ OUTSIDE = Case(
 )
 
 
-# --- 4: poisoned records ----------------------------------------------------------------------------------------------
+# --- 4: poisoned records --------------------------------------------------------------------------
+
 
 def _poisoned(f: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Contributions with an outlier of 1e6 times the mean, NaN, infinities of both signs and denormals among them."""
@@ -98,7 +99,10 @@ def _poison(guide: str, effort: Effort, folder: Path) -> Finding | None:
     for seed in range(effort.seeds):
         # No more paths than a render's pilot has.
         pilot = bench.scene.pilot(
-            spp=max(effort.spp // 4, 2), seed=seed + 1, emitter_strategy=strategy, threads=effort.threads
+            spp=max(effort.spp // 4, 2),
+            seed=seed + 1,
+            emitter_strategy=strategy,
+            threads=effort.threads,
         )
         f = _poisoned(pilot.f, np.random.default_rng(seed))
         fitted = replace(pilot, f=f).fit(name, seed=seed, **options)
@@ -120,12 +124,12 @@ POISON = Case(
     4,
     "poisoned-training",
     "Outliers, NaN and infinities in training",
-    "One path of 1e6 times the mean, three each of NaN, ±∞, denormal and negative radiance among the records: a loss that "
-    "is not finite once is so for ever, and one outlier pulls all mass to itself.",
+    "One path of 1e6 times the mean, three each of NaN, ±∞, denormal and negative radiance among the records: a "
+    "loss that is not finite once is so for ever, and one outlier pulls all mass to itself.",
     probe=_poison,
 )
 
-# --- 5: almost nothing to learn from ----------------------------------------------------------------------------------
+# --- 5: almost nothing to learn from --------------------------------------------------------------
 
 FEW = Case(
     5,
@@ -140,24 +144,34 @@ FEW = Case(
     ),
 )
 
-# --- 11: training that is far too fast --------------------------------------------------------------------------------
+# --- 11: training that is far too fast ------------------------------------------------------------
 
 FAST = 100.0
 """Times the usual learning rate."""
 
-RATES = {THESIS: 1e-3, "realnvp": 1e-3, "realnvp-logit": 1e-3, "mixture-net": 5e-3, "spline-net": 5e-3}
+RATES = {
+    THESIS: 1e-3,
+    "realnvp": 1e-3,
+    "realnvp-logit": 1e-3,
+    "mixture-net": 5e-3,
+    "spline-net": 5e-3,
+}
 """Usual learning rates."""
 
 
 def _aggressive(guide: str, effort: Effort, folder: Path) -> Finding | None:
-    """Trains a hundred times too fast: it stops and says so, or what it draws still has the density that it states."""
+    """Trains a hundred times too fast: it stops and says so, or what it draws still has the density that it
+    states.
+    """
     if guide not in RATES:
         return None
     rate = {"learning_rate": min(FAST * RATES[guide], 1.0)}
     bench = Bench.of(Setting("room", room, guide_options={guide: rate}), effort)
     results = bench.run(guide)
     found = judge(bench, results)
-    errors = [e for r in results if isinstance(r.guide, Guide) and (e := _round_trip(r.guide)) is not None]
+    errors = [
+        e for r in results if isinstance(r.guide, Guide) and (e := _round_trip(r.guide)) is not None
+    ]
     stopped = sum("diverged" in " ".join(r.notes) for r in results)
     numbers = {**found.numbers, "diverged": float(stopped)}
     figure = found.figure
@@ -171,8 +185,9 @@ def _aggressive(guide: str, effort: Effort, folder: Path) -> Finding | None:
 
 
 def _round_trip(guide: Guide) -> float | None:
-    """Largest difference between the log-density that a whole-path guide states when it draws numbers inside the cube,
-    and the one that it computes for these numbers, among all but the worst thousandth."""
+    """Largest difference between the log-density that a whole-path guide states when it draws numbers inside
+    the cube, and the one that it computes for these numbers, among all but the worst thousandth.
+    """
     if "path" not in guide.models:
         return None
     u, drawn = guide.sample(4096, seed=5)
@@ -187,12 +202,12 @@ AGGRESSIVE = Case(
     11,
     "aggressive-training",
     "Training a hundred times too fast",
-    "Scales saturate, inverses lose their digits in float32, losses become NaN. The density that a path is divided by must "
-    "stay the one that it was drawn from.",
+    "Scales saturate, inverses lose their digits in float32, losses become NaN. The density that a path is "
+    "divided by must stay the one that it was drawn from.",
     probe=_aggressive,
 )
 
-# --- 12: overfitting --------------------------------------------------------------------------------------------------
+# --- 12: overfitting ------------------------------------------------------------------------------
 
 OVERFIT = Case(
     12,
@@ -205,7 +220,9 @@ OVERFIT = Case(
             lambda _: room(10),
             {"pilot_spp": 2},
             {
-                **{name: {"epochs": 200, "samples": 200, "outlier_quantile": 1.0} for name in FLOWS},
+                **{
+                    name: {"epochs": 200, "samples": 200, "outlier_quantile": 1.0} for name in FLOWS
+                },
                 "mixture-net": {"epochs": 200},
                 "spline-net": {"epochs": 200},
             },
@@ -214,7 +231,7 @@ OVERFIT = Case(
     ),
 )
 
-# --- 15: a moving target ----------------------------------------------------------------------------------------------
+# --- 15: a moving target --------------------------------------------------------------------------
 
 
 def _spot(x: float) -> Callable[[int], dict[str, Any]]:
@@ -234,8 +251,9 @@ LEFT, RIGHT = _spot(-0.7), _spot(0.7)
 
 
 def _moving(guide: str, effort: Effort, folder: Path) -> Finding | None:
-    """Learns with the lamp on the left and renders with the lamp on the right: the saved guide is refused, and the object
-    itself loses no more than 1/a."""
+    """Learns with the lamp on the left and renders with the lamp on the right: the saved guide is refused, and
+    the object itself loses no more than 1/a.
+    """
     if guide == "none":
         return None
     here = Bench.of(Setting("lamp on the right", RIGHT, blind=True), effort)
@@ -261,7 +279,12 @@ def _moving(guide: str, effort: Effort, folder: Path) -> Finding | None:
         options = {"emitter_strategy": "nee", "uniform_fraction": 0.0} if guide == THESIS else {}
         results.append(
             here.scene.render(
-                learned, effort.spp, seed=1000 + seed, threads=effort.threads, progress=False, **options
+                learned,
+                effort.spp,
+                seed=1000 + seed,
+                threads=effort.threads,
+                progress=False,
+                **options,
             )
         )
     found = judge(here, results)

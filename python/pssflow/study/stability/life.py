@@ -13,7 +13,7 @@ from typing import Any
 from ...files import first_line
 from ...guide import Guide
 from ...scene import Scene
-from .case import THESIS, Case, Effort, Finding, render_options
+from .case import Case, Effort, Finding, render_options
 from .parts import room
 
 __all__ = ["FILES", "MEMORY"]
@@ -59,7 +59,9 @@ def _files(guide: str, effort: Effort, folder: Path) -> Finding | None:
             return Finding("fails", f"half-written files are left: {', '.join(left)}")
     finally:
         path.unlink(missing_ok=True)
-    return Finding("holds", f"{min(CUTS + 1, len(whole))} cuts of {len(whole)} bytes refused, full disk told")
+    return Finding(
+        "holds", f"{min(CUTS + 1, len(whole))} cuts of {len(whole)} bytes refused, full disk told"
+    )
 
 
 def _interrupt(phase: str, share: float) -> None:
@@ -95,7 +97,9 @@ def _memory(guide: str, effort: Effort, folder: Path) -> Finding | None:
     if left:
         return Finding("fails", f"half-written files are left: {', '.join(left)}")
     if answer.startswith("died"):
-        return Finding("degrades", answer, "the system's allocator ends the process; no file is half-written")
+        return Finding(
+            "degrades", answer, "the system's allocator ends the process; no file is half-written"
+        )
     return Finding("holds", answer)
 
 

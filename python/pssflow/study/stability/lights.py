@@ -9,14 +9,14 @@ import mitsuba as mi
 import numpy as np
 
 from ...scene import Scene
-from .case import Case, F32, Setting
-from .parts import area, box, camera, diffuse, lamp, rgb, room, sphere, square, twosided
+from .case import F32, Case, Setting
+from .parts import area, camera, diffuse, lamp, rgb, room, sphere, square, twosided
 
 __all__ = ["BORDERS", "CLOSE", "EASY", "MODES", "SLIT", "SPREAD"]
 
 Description = dict[str, Any]
 
-# --- 3: a light behind a slit -----------------------------------------------------------------------------------------
+# --- 3: a light behind a slit ---------------------------------------------------------------------
 
 SPOT_AT = (0.35, 0.45)
 SUN = 2.7
@@ -25,12 +25,19 @@ FLOOR = 0.6
 
 
 def _house(side: int, half: float, *, sunlit: bool, spot: bool, dark: bool = False) -> Description:
-    """A room with a lamp, whose ceiling has a hole through which the sun falls straight down on a spot of the floor; or
-    with a square emitter in the place of that spot."""
+    """A room with a lamp, whose ceiling has a hole through which the sun falls straight down on a spot of the
+    floor; or with a square emitter in the place of that spot.
+    """
     walls = twosided(diffuse(FLOOR))
     scene: Description = {"type": "scene", "camera": camera(side, target=(0.0, 1.0, 0.0))}
     T = mi.ScalarTransform4f
-    sides = {"back": (0, 1, 0), "front": (0, -1, 0), "left": (-1, 0, 0), "right": (1, 0, 0), "floor": (0, 0, -1)}
+    sides = {
+        "back": (0, 1, 0),
+        "front": (0, -1, 0),
+        "left": (-1, 0, 0),
+        "right": (1, 0, 0),
+        "floor": (0, 0, -1),
+    }
     for name, out in sides.items():
         inward = (-out[0], -out[1], -out[2])
         scene[name] = {**square(out, inward, 1.0), "bsdf": walls}
@@ -44,7 +51,11 @@ def _house(side: int, half: float, *, sunlit: bool, spot: bool, dark: bool = Fal
             (x - half, x + half, y + half, 1),
         ]
     ):
-        place = T().translate([(x0 + x1) / 2, (y0 + y1) / 2, 1.0]).scale([(x1 - x0) / 2, (y1 - y0) / 2, 1])
+        place = (
+            T()
+            .translate([(x0 + x1) / 2, (y0 + y1) / 2, 1.0])
+            .scale([(x1 - x0) / 2, (y1 - y0) / 2, 1])
+        )
         scene[f"ceiling-{i}"] = {"type": "rectangle", "to_world": place, "bsdf": walls}
     if not dark:
         scene["lamp"] = lamp((0.0, 0.2, 0.98), (0.0, 0.0, -1.0), 0.25, 5.0)
@@ -63,7 +74,9 @@ def _slit(name: str, half: float, spp: int, side: int) -> Setting:
     """A hole so small that the pilot misses the spot below it, and so many samples that the render does not."""
 
     def truth(side: int, runs: int, spp: int, threads: int | None) -> F32:
-        """Two bounces from the lamp, and one from an emitter in the place of the spot: the same light, easy to find."""
+        """Two bounces from the lamp, and one from an emitter in the place of the spot: the same light, easy to
+        find.
+        """
         lit = Scene(_house(side, half, sunlit=False, spot=False))
         glow = Scene(_house(side, half, sunlit=False, spot=True, dark=True))
         how = {"threads": threads, "progress": False}
@@ -91,7 +104,7 @@ SLIT = Case(
     (_slit("1 path in 1e4", 0.03, 1024, 8), _slit("1 path in 1e5", 0.0095, 4096, 16)),
 )
 
-# --- 6: mass at the borders -------------------------------------------------------------------------------------------
+# --- 6: mass at the borders -----------------------------------------------------------------------
 
 
 def _grazing(side: int) -> Description:
@@ -118,7 +131,9 @@ def _rim_of_lamp(side: int) -> Description:
 
 
 def _last_of_many(side: int) -> Description:
-    """Thirty-two lamps of which only the first and the last are in the room: the emitter's number is at its borders."""
+    """Thirty-two lamps of which only the first and the last are in the room: the emitter's number is at its
+    borders.
+    """
     lamps: Description = {}
     for i in range(32):
         inside = i in (0, 31)
@@ -131,8 +146,8 @@ BORDERS = Case(
     6,
     "borders",
     "Mass at the borders of the cube",
-    "Light where numbers are near 0 or 1: grazing directions, the rim of a lamp, the first and the last emitter. Normal "
-    "priors end there slowly, logits go to infinity, histograms must not step over the edge.",
+    "Light where numbers are near 0 or 1: grazing directions, the rim of a lamp, the first and the last emitter. "
+    "Normal priors end there slowly, logits go to infinity, histograms must not step over the edge.",
     (
         Setting("grazing", _grazing),
         Setting("rim of the lamp", _rim_of_lamp),
@@ -140,7 +155,7 @@ BORDERS = Case(
     ),
 )
 
-# --- 7: disconnected modes --------------------------------------------------------------------------------------------
+# --- 7: disconnected modes ------------------------------------------------------------------------
 
 
 def _modes(count: int) -> Any:
@@ -151,7 +166,12 @@ def _modes(count: int) -> Any:
             place = (0.8 * math.cos(angle), 0.8 * math.sin(angle), 0.97)
             lamps[f"lamp-{i:02}"] = lamp(place, (0.0, 0.0, -1.0), 0.03, 40.0 + 20.0 * (i % 3))
             # A tube under each: it lights a spot of the floor, and nothing between the spots.
-            tube = {"type": "cylinder", "p0": [*place[:2], 0.98], "p1": [*place[:2], 0.6], "radius": 0.09}
+            tube = {
+                "type": "cylinder",
+                "p0": [*place[:2], 0.98],
+                "p1": [*place[:2], 0.6],
+                "radius": 0.09,
+            }
             lamps[f"tube-{i:02}"] = {**tube, "bsdf": twosided(diffuse(0.02))}
         return room(side, lamp=None, ball=None, **lamps)
 
@@ -162,12 +182,16 @@ MODES = Case(
     7,
     "disconnected-modes",
     "Disconnected modes",
-    "Spots of light with nothing between them. A flow that bends one bell curve must tear it, and leaves bridges; modes "
-    "that it drops come back as fireflies.",
-    (Setting("5 lights", _modes(5)), Setting("2 lights", _modes(2)), Setting("32 lights", _modes(32))),
+    "Spots of light with nothing between them. A flow that bends one bell curve must tear it, and leaves "
+    "bridges; modes that it drops come back as fireflies.",
+    (
+        Setting("5 lights", _modes(5)),
+        Setting("2 lights", _modes(2)),
+        Setting("32 lights", _modes(32)),
+    ),
 )
 
-# --- 8: close lights and caustics -------------------------------------------------------------------------------------
+# --- 8: close lights and caustics -----------------------------------------------------------------
 
 
 def _close(side: int) -> Description:
@@ -190,24 +214,27 @@ CLOSE = Case(
     8,
     "close-lights-and-caustics",
     "A light close to a wall; caustics",
-    "1/r² near a small light has no variance by emitter samples alone; light focused by rough glass, mirrors and glass "
-    "cannot be joined to a light at all.",
+    "1/r² near a small light has no variance by emitter samples alone; light focused by rough glass, mirrors and "
+    "glass cannot be joined to a light at all.",
     (
         Setting("lamp at the wall", _close),
-        Setting("rough glass", _behind({"type": "roughdielectric", "alpha": 0.05, "distribution": "ggx"})),
+        Setting(
+            "rough glass",
+            _behind({"type": "roughdielectric", "alpha": 0.05, "distribution": "ggx"}),
+        ),
         Setting("mirror", _behind({"type": "conductor"})),
         Setting("glass", _behind({"type": "dielectric"})),
     ),
 )
 
-# --- 13, 14: the plain room many times; nothing to learn --------------------------------------------------------------
+# --- 13, 14: the plain room many times; nothing to learn ------------------------------------------
 
 SPREAD = Case(
     13,
     "run-to-run-spread",
     "Spread between runs",
-    "Many short renders of a plain room (Celarek et al. 2019): a method whose error now and then is ten times its usual "
-    "one looks fine in most pictures.",
+    "Many short renders of a plain room (Celarek et al. 2019): a method whose error now and then is ten times "
+    "its usual one looks fine in most pictures.",
     (Setting("short renders", room, spp=16),),
 )
 

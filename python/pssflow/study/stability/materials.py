@@ -8,7 +8,19 @@ import mitsuba as mi
 import numpy as np
 
 from .case import Case, Setting
-from .parts import CAMERA_AT, CAMERA_TO, area, camera, diffuse, lamp, room, sphere, square, twosided
+from .parts import (
+    CAMERA_AT,
+    CAMERA_TO,
+    Triple,
+    area,
+    camera,
+    diffuse,
+    lamp,
+    room,
+    sphere,
+    square,
+    twosided,
+)
 
 __all__ = ["EXTREMES", "GLOSSY", "SCALES"]
 
@@ -40,8 +52,8 @@ GLOSSY = Case(
     9,
     "glossy-and-masks",
     "Glossy surfaces and masks",
-    "Lobes as narrow as α = .01 turn with the view, so that a cell or a pixel says little; masks let light through in "
-    "patterns that no smooth density follows.",
+    "Lobes as narrow as α = .01 turn with the view, so that a cell or a pixel says little; masks let light "
+    "through in patterns that no smooth density follows.",
     (
         Setting("α = .1", _glossy(0.1)),
         Setting("α = .01", _glossy(0.01)),
@@ -67,13 +79,14 @@ def _placed(factor: float, offset: float) -> Any:
                 own = T().translate(part["center"]).scale(part["radius"])
                 rest = {k: v for k, v in part.items() if k not in ("center", "radius")}
                 moved[name] = {**rest, "to_world": by @ own}
+
         # A camera's transform may hold no scale.
-        origin, target = (
-            tuple(a + factor * x for a, x in zip(away, point, strict=True))
-            for point in (CAMERA_AT, CAMERA_TO)
-        )
+        def moved_point(point: Triple) -> Triple:
+            x, y, z = (a + factor * c for a, c in zip(away, point, strict=True))
+            return x, y, z
+
         clip = {"near_clip": 1e-3 * factor, "far_clip": 1e3 * factor}
-        moved["camera"] = camera(side, origin, target, **clip)
+        moved["camera"] = camera(side, moved_point(CAMERA_AT), moved_point(CAMERA_TO), **clip)
         return moved
 
     return scene
@@ -107,8 +120,8 @@ SCALES = Case(
     10,
     "scales",
     "Extreme scales",
-    "The same room a ten-thousandth and a million times as large, far from the origin, with needles and coincident faces, "
-    "lamps of 1e-6 to 1e8 W: whatever has an absolute epsilon breaks.",
+    "The same room a ten-thousandth and a million times as large, far from the origin, with needles and "
+    "coincident faces, lamps of 1e-6 to 1e8 W: whatever has an absolute epsilon breaks.",
     (
         Setting("× 1e6", _placed(1e6, 0.0)),
         Setting("× 1e-4", _placed(1e-4, 0.0)),

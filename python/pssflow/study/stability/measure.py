@@ -2,8 +2,8 @@
 
 A guide *holds* where its images are finite and unbiased (Welch's test of the mean and of tiles against the truth), no
 path weighs more than 1/a, E[(f/m)²] ≤ E[f²]/a within its error, and its relMSE is at most 1.3 times that of as many
-random samples (median over seeds). It *degrades* where it is only slower, and *fails* where one of the others breaks, or
-where it is more than ten times slower: no mixture with a = .1 can be.
+random samples (median over seeds). It *degrades* where it is only slower, and *fails* where one of the others
+breaks, or where it is more than ten times slower: no mixture with a = .1 can be.
 """
 
 from __future__ import annotations
@@ -54,9 +54,7 @@ class Bench:
     @classmethod
     def of(cls, setting: Setting, effort: Effort) -> Bench:
         """Loads a setting's scene and renders what guides are compared with."""
-        effort = replace(
-            effort, spp=setting.spp or effort.spp, side=setting.side or effort.side
-        )
+        effort = replace(effort, spp=setting.spp or effort.spp, side=setting.side or effort.side)
         scene = Scene(setting.scene(effort.side))
         many = {**setting.options, "threads": effort.threads, "progress": False}
         if setting.truth is not None:
@@ -109,9 +107,7 @@ def judge(bench: Bench, results: Sequence[Result]) -> Finding:
     images = np.stack([result.image for result in results])
     last = results[-1].stats
     first = results[0]
-    warnings = tuple(
-        dict.fromkeys(w for r in results for w in r.stats["diagnostics"]["warnings"])
-    )
+    warnings = tuple(dict.fromkeys(w for r in results for w in r.stats["diagnostics"]["warnings"]))
     ks = [k for r in results if (k := r.stats["diagnostics"]["pareto_k"]) is not None]
     chosen = sorted({result.stats["chosen"] for result in results})
     a = min(float(result.stats["a"]) for result in results)
@@ -135,7 +131,10 @@ def judge(bench: Bench, results: Sequence[Result]) -> Finding:
     truth = bench.truth.mean(axis=0)
     if not truth.any():
         lit = float(np.abs(images).max())
-        return finding("holds" if lit == 0 else "fails", "black, as it should be" if lit == 0 else f"{lit:g} in a black image")
+        return finding(
+            "holds" if lit == 0 else "fails",
+            "black, as it should be" if lit == 0 else f"{lit:g} in a black image",
+        )
     numbers |= _errors(bench, images)
     numbers["bound"], error = _bound(bench, results, a)
     numbers["bound_error"] = error
@@ -168,7 +167,7 @@ def judge(bench: Bench, results: Sequence[Result]) -> Finding:
 
 
 def _errors(bench: Bench, images: F32) -> dict[str, float | None]:
-    """relMSE of guide and random numbers, medians over the seeds, and how far outliers stand out."""
+    """RelMSE of guide and random numbers, medians over the seeds, and how far outliers stand out."""
     truth = bench.truth.mean(axis=0)
     variance = bench.truth.var(axis=0, ddof=1) / len(bench.truth)
     ours = np.array([metrics.relmse(image, truth, variance) for image in images])
@@ -185,12 +184,18 @@ def _errors(bench: Bench, images: F32) -> dict[str, float | None]:
 
 
 def _bound(bench: Bench, results: Sequence[Result], a: float) -> tuple[float | None, float]:
-    """a · E[(f/m)²] ÷ E[f²], and its standard error from the spread between seeds."""
+    """The ratio a · E[(f/m)²] ÷ E[f²], and its standard error from the spread between seeds."""
     ours = np.array([r.stats["diagnostics"]["mean_square"] for r in results], np.float64)
     theirs = np.array([r.stats["diagnostics"]["mean_square"] for r in bench.random], np.float64)
-    if theirs.mean() <= 0.0 or bench.random[0].stats["emitter_strategy"] != results[0].stats["emitter_strategy"]:
+    if (
+        theirs.mean() <= 0.0
+        or bench.random[0].stats["emitter_strategy"] != results[0].stats["emitter_strategy"]
+    ):
         return None, 0.0
-    spread = [side.std(ddof=1) / math.sqrt(len(side)) / max(side.mean(), 1e-300) for side in (ours, theirs)]
+    spread = [
+        side.std(ddof=1) / math.sqrt(len(side)) / max(side.mean(), 1e-300)
+        for side in (ours, theirs)
+    ]
     ratio = a * ours.mean() / theirs.mean()
     return float(ratio), float(ratio * math.hypot(*spread))
 

@@ -108,7 +108,8 @@ def box(bsdf: Description, half: float = 1.0, center: Triple = (0.0, 0.0, 0.0)) 
 
 def room(side: int | tuple[int, int], **objects: Any) -> Description:
     """A closed grey room of side 2 around the origin, seen from its front wall, with a lamp on the ceiling unless
-    `lamp` says otherwise."""
+    `lamp` says otherwise.
+    """
     scene: Description = {
         "type": "scene",
         "camera": camera(side),

@@ -7,7 +7,16 @@ from .case import Case
 
 __all__ = ["CASES", "STANDARD"]
 
-STANDARD = ("thesis", "realnvp", "realnvp-logit", "vegas", "table", "mixture-net", "spline-net", "auto")
+STANDARD = (
+    "thesis",
+    "realnvp",
+    "realnvp-logit",
+    "vegas",
+    "table",
+    "mixture-net",
+    "spline-net",
+    "auto",
+)
 """Guides that the study shows."""
 
 CASES: dict[str, Case] = {

@@ -98,7 +98,9 @@ class Rows:
         try:
             with path.open(newline="", encoding="utf-8") as file:
                 for texts in csv.DictReader(file):
-                    values: dict[str, Any] = {f.name: texts[f.name] for f in dataclasses.fields(Row)}
+                    values: dict[str, Any] = {
+                        f.name: texts[f.name] for f in dataclasses.fields(Row)
+                    }
                     for name in ("number", "seeds", "spp", "side"):
                         values[name] = int(values[name])
                     self.rows.append(Row(**values))
@@ -159,7 +161,10 @@ def publish(
     names = [titles[case] for case in cases]
     verdict_chart(folder / "stability.png", heading, names, guides, grid, CAPTION)
     counts = [
-        [guide, *(str(sum(r.verdict == v for r in rows if r.guide == guide)) for v in VERDICT_COLOURS)]
+        [
+            guide,
+            *(str(sum(r.verdict == v for r in rows if r.guide == guide)) for v in VERDICT_COLOURS),
+        ]
         for guide in guides
     ]
     lines = [
@@ -187,8 +192,9 @@ def publish(
 
 
 CAPTION = (
-    "Numbers are relMSE ÷ that of as many random samples (medians over seeds). Holds: finite, unbiased, no weight above "
-    "1/a, at most 1.3. Degrades: safe, but slower. Fails: biased, unbounded, not finite, or more than 10 times slower. "
+    "Numbers are relMSE ÷ that of as many random samples (medians over seeds). Holds: finite, unbiased, no weight "
+    "above 1/a, at most 1.3. Degrades: safe, but slower. Fails: biased, unbounded, not finite, or more than ten times "
+    "slower. "
     "thesis: a = 0; all others with the guide's own share a of random numbers."
 )
 
