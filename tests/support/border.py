@@ -142,7 +142,7 @@ def scene_file(case: Case, report: Report) -> Answer:
         if not np.isfinite(result.image).all():
             raise AssertionError("the image holds values that are not finite")
 
-    return _judge(render)
+    return judge(render)
 
 
 def exported(case: Case, report: Report) -> Answer:
@@ -162,7 +162,7 @@ def exported(case: Case, report: Report) -> Answer:
         if not np.isfinite(image).all():
             raise AssertionError("the image holds values that are not finite")
 
-    return _judge(render)
+    return judge(render)
 
 
 _WHOLE: dict[Path, tuple[dict[str, Any], list[NDArray[Any]]]] = {}
@@ -178,7 +178,7 @@ def _whole(path: Path) -> tuple[dict[str, Any], list[NDArray[Any]]]:
     return _WHOLE[path]
 
 
-def _judge(render: Callable[[], None]) -> Answer:
+def judge(render: Callable[[], None]) -> Answer:
     """A `ValueError` (an `OSError` for a missing file) of one line is right; anything else is not."""
     try:
         render()

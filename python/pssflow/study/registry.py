@@ -17,6 +17,10 @@ STUDIES = {
         "speed_accuracy",
         "Error against wall time: guides, Mitsuba and others, with charts and an image viewer.",
     ),
+    "stability": (
+        "stability.command",
+        "Planted failures: what holds, degrades or fails with each guide, and with the thesis' method.",
+    ),
 }
 """Name → the module in this package that defines a command of that name, and what it shows."""
 

@@ -182,7 +182,7 @@ pub fn select(
                         }
                     }
                 }
-                Err(GuideError::TooFewPaths { .. }) => {}
+                Err(GuideError::TooFewPaths { .. } | GuideError::Diverged { .. }) => {}
                 Err(e) => return Err(e),
             }
         }

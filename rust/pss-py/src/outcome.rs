@@ -49,6 +49,7 @@ fn record(outcome: &Outcome, options: &Options) -> Value {
     let mut record = json!(outcome.rendered.counts);
     let mut pilot = json!(outcome.pilot.counts);
     pilot["nonzero_share"] = json!(outcome.pilot.counts.nonzero_share());
+    pilot["mean_square"] = json!(outcome.pilot.estimates().mean_square());
     let summary = json!({
         "chosen": outcome.chosen,
         "a": outcome.uniform_fraction,
@@ -64,6 +65,7 @@ fn record(outcome: &Outcome, options: &Options) -> Value {
         "max_weight": outcome.in_image.max_weight,
         "max_contribution": outcome.in_image.max_contribution(),
         "ess": outcome.in_image.ess(),
+        "diagnostics": outcome.diagnostics,
         "passes": outcome.passes,
         "combine": options.combine.name(),
         "candidates": outcome.candidates,

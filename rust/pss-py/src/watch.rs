@@ -62,14 +62,16 @@ pub(crate) fn watched<T: Send>(
 ) -> PyResult<T> {
     let shared = &Shared::default();
     let (done, finished) = mpsc::channel();
-    let (result, interrupt) = py.detach(move || {
+    let watched = py.detach(move || {
         std::thread::scope(|scope| {
-            let worker = scope.spawn(move || {
+            let named = std::thread::Builder::new().name("pssflow-work".to_owned());
+            // Not `scope.spawn`, which panics where the system has no memory for another thread's stack.
+            let worker = named.spawn_scoped(scope, move || {
                 let result = work(shared);
                 // The watcher only leaves after this thread, so somebody listens.
                 let _ = done.send(());
                 result
-            });
+            })?;
             let mut interrupt = None;
             // A panic drops the sender and ends the wait as well.
             while finished.recv_timeout(TICK) == Err(mpsc::RecvTimeoutError::Timeout) {
@@ -88,9 +90,12 @@ pub(crate) fn watched<T: Send>(
                     interrupt = Some(error);
                 }
             }
-            (worker.join(), interrupt)
+            Ok((worker.join(), interrupt))
         })
     });
+    let (result, interrupt) = watched.map_err(|e: std::io::Error| {
+        pyo3::exceptions::PyRuntimeError::new_err(format!("cannot start a thread: {e}"))
+    })?;
     match (result, interrupt) {
         (_, Some(error)) => Err(error),
         (Ok(result), None) => Ok(result),

@@ -8,6 +8,7 @@ use pss_render::{Accumulator, Developed, Scene, Tracer};
 use serde::Serialize;
 
 use crate::combine::by_variance;
+use crate::diagnostics::{Diagnostics, Evidence, Pools};
 use crate::error::RenderError;
 use crate::learning::Current;
 use crate::mixture::Mixture;
@@ -58,6 +59,8 @@ pub struct Outcome {
     pub rendered: Statistics,
     /// All paths in the image: the rendered ones, and the pilot's where it was kept.
     pub in_image: Statistics,
+    /// Whether the variance can be believed.
+    pub diagnostics: Diagnostics,
     /// Wall time by phase.
     pub seconds: Seconds,
     /// Wall time of all phases and what lies between them, without what snapshots took.
@@ -136,6 +139,7 @@ pub fn render(
         passes: Vec::new(),
         pilot: Statistics::default(),
         rendered: Statistics::default(),
+        pools: Pools::default(),
         seconds: Seconds::default(),
         snapshots: Snapshots::at(&options.snapshots),
     };
@@ -181,6 +185,7 @@ pub(crate) struct Run<'a> {
     pub(crate) passes: Vec<PassPlan>,
     pub(crate) pilot: Statistics,
     rendered: Statistics,
+    pools: Pools,
     pub(crate) seconds: Seconds,
     pub(crate) snapshots: Snapshots,
 }
@@ -210,7 +215,7 @@ impl Run<'_> {
         } else {
             0.0
         };
-        let older = self.records.len();
+        let mut older = self.records.len();
         if record > 0.0 {
             self.reserve_records();
         }
@@ -236,6 +241,8 @@ impl Run<'_> {
         self.apart.extend(own.filter(|_| !discarded));
         if record > 0.0 {
             self.records.count(statistics.counts.camera_rays);
+            // Where memory ran out, older ones gave way.
+            older = older.min(self.records.len());
             let newer = self.records.len() - older;
             let rest = self.options.max_records.saturating_sub(newer);
             self.records.thin(older, [rest, newer]);
@@ -251,6 +258,9 @@ impl Run<'_> {
             self.seconds.render += seconds;
         }
         let guided = guide.is_some();
+        if guided {
+            self.pools.add_pass(&statistics);
+        }
         let fresh = std::mem::take(&mut self.current.fresh);
         self.passes.push(PassPlan {
             kind: match kind {
@@ -281,7 +291,8 @@ impl Run<'_> {
 
     /// Whether any path is in the image yet.
     pub(crate) fn has_image(&self) -> bool {
-        self.in_image().counts.camera_rays > 0
+        let pilot = self.options.keep_pilot && self.pilot.counts.camera_rays > 0;
+        pilot || self.rendered.counts.camera_rays > 0
     }
 
     /// Passes in the image, where these are kept apart.
@@ -300,7 +311,7 @@ impl Run<'_> {
     }
 
     fn in_image(&self) -> Statistics {
-        let mut all = self.rendered;
+        let mut all = self.rendered.clone();
         if self.options.keep_pilot {
             all.add(&self.pilot);
         }
@@ -322,19 +333,23 @@ impl Run<'_> {
             }
             _ => {}
         }
+        notes.extend(self.current.diverged.clone());
+        if self.pilot.short_of_memory || self.rendered.short_of_memory {
+            notes.push("memory was short: fewer paths were kept to learn from".to_owned());
+        }
         let [width, height] = scene.film().crop_size();
-        let mut all = self.pilot;
-        all.add(&self.rendered);
-        if all.counts.non_finite > 0 {
+        let mut all = self.pilot.counts;
+        all.add(&self.rendered.counts);
+        if all.non_finite > 0 {
             notes.push(format!(
                 "{} paths were not finite and count as zero",
-                all.counts.non_finite
+                all.non_finite
             ));
         }
-        if all.counts.nonzero == 0 {
+        if all.nonzero == 0 {
             let why = if scene.emitters().is_empty() {
                 "the scene has no emitter"
-            } else if all.counts.paths_found == 0 {
+            } else if all.paths_found == 0 {
                 "no path found all its vertices"
             } else {
                 "no path carried light"
@@ -345,6 +360,16 @@ impl Run<'_> {
             Some((guide, name, a)) => (Some(Arc::clone(guide)), name.clone(), *a),
             None => (None, "none".to_owned(), 1.0),
         };
+        let in_image = self.in_image();
+        let diagnostics = Diagnostics::of(&Evidence {
+            in_image: &in_image,
+            pilot: &self.pilot,
+            rendered: &self.rendered,
+            pools: &self.pools,
+            mass_outside: guide.as_ref().map(|g| g.mass_outside()),
+            film: &film,
+        });
+        notes.extend(diagnostics.warnings.iter().cloned());
         Outcome {
             width,
             height,
@@ -356,9 +381,10 @@ impl Run<'_> {
             notes,
             training: self.current.training.clone(),
             passes: self.passes.clone(),
-            pilot: self.pilot,
-            rendered: self.rendered,
-            in_image: self.in_image(),
+            pilot: self.pilot.clone(),
+            rendered: self.rendered.clone(),
+            in_image,
+            diagnostics,
             seconds: self.seconds,
             elapsed,
             threads: self.context.pool.current_num_threads(),

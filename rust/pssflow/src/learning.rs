@@ -53,6 +53,8 @@ pub(crate) struct Current {
     pub(crate) candidates: serde_json::Value,
     /// Why there is no guide where one was asked for.
     pub(crate) refusal: Option<String>,
+    /// How its training broke off.
+    pub(crate) diverged: Option<String>,
 }
 
 impl Current {
@@ -236,6 +238,16 @@ impl Run<'_> {
                 Ok(None)
             }
             Err(GuideError::Cancelled) => Err(RenderError::Cancelled),
+            // What diverged once would most likely do so again, and what it drew would be worthless.
+            Err(e @ GuideError::Diverged { .. }) => {
+                self.current.settled = true;
+                let instead = match self.current.guide {
+                    Some(_) => "the one learned before",
+                    None => "none",
+                };
+                self.current.diverged = Some(format!("{e}; {instead} is used"));
+                Ok(None)
+            }
             Err(e @ GuideError::TooFewPaths { .. }) => {
                 self.current.refusal = Some(format!("{e}; none is used"));
                 Ok(None)

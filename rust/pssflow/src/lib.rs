@@ -10,6 +10,7 @@
 mod auto;
 mod choice;
 mod combine;
+mod diagnostics;
 mod error;
 mod estimator;
 mod learning;
@@ -24,18 +25,21 @@ mod schedule;
 mod snapshots;
 mod statistics;
 mod strategy;
+mod tail;
 mod trace;
 
 pub use auto::{Auto, Named};
 pub use choice::{Chooser, Chosen, GuideChoice, Learner, Left};
+pub use diagnostics::{Diagnostics, Means, Measured, SecondMoment};
 pub use error::RenderError;
 pub use estimator::{Outcome, Seconds, render};
 pub use mixture::Mixture;
 pub use options::{Budget, Combine, Options, PassKind, PassPlan};
 pub use progress::{Phase, Progress, Silent};
 pub use snapshots::Snapshot;
-pub use statistics::{Counts, Statistics};
+pub use statistics::{Counts, Moments, Statistics};
 pub use strategy::{AutoStrategy, auto_strategy};
+pub use tail::{Pareto, Tail};
 pub use trace::{RayTiming, rays_alone, trace_blocks, uniform_paths};
 
 pub use pss_guide;

@@ -1,6 +1,6 @@
 //! The joint defensive mixture, and the one place where f is divided by a density.
 
-use pss_render::math::Rgb;
+use pss_render::math::{Rgb, luminance};
 
 /// m = a + (1 − a)·q over all guided decisions of a path together: one coin a path makes either all of
 /// them from q or all of them uniform, and both cases are divided by the same m. So 1/m ≤ 1/a for any
@@ -44,6 +44,32 @@ impl Mixture {
         }
         (estimate, weight)
     }
+
+    /// 1/m; 0 where that is not finite, which needs a = 0 and a guide that drew what it holds impossible.
+    #[inline]
+    pub(crate) fn weight(&self, q: f32) -> f32 {
+        let weight = 1.0 / self.density(q);
+        if weight.is_finite() { weight } else { 0.0 }
+    }
+
+    /// f²/m of the luminances, term by term: its mean over uniform numbers is ∫f²/m, which decides the variance. For a
+    /// path that the guide drew it is divided by q, too: the same integral, as far as the guide's own paths see it.
+    #[inline]
+    pub fn square(&self, f_nee: Rgb, q_nee: f32, f_bsdf: Rgb, q_bsdf: f32, guided: bool) -> f64 {
+        let mut sum = 0.0;
+        for (f, q) in [(f_nee, q_nee), (f_bsdf, q_bsdf)] {
+            if f != Rgb::ZERO {
+                let drawn = if guided {
+                    q.max(f32::MIN_POSITIVE)
+                } else {
+                    1.0
+                };
+                let (y, m) = (f64::from(luminance(f)), f64::from(self.density(q)));
+                sum += y * y / (m * f64::from(drawn));
+            }
+        }
+        sum
+    }
 }
 
 #[cfg(test)]
@@ -72,6 +98,20 @@ mod tests {
         let (estimate, weight) = m.divide(f, 1.0, f, 1.0);
         assert!((estimate - f * 2.0).length() < 1e-5);
         assert_eq!(weight, 1.0);
+    }
+
+    #[test]
+    fn squares_are_the_same_integral_by_uniform_and_by_guided_paths() {
+        // q = 2 on half of the cube, 0 on the rest, f = 3 on the first: ∫f²/m = ½ · 9/m.
+        let m = Mixture {
+            uniform_fraction: 0.2,
+        };
+        let f = Rgb::splat(3.0);
+        let uniform = 0.5 * m.square(f, 2.0, Rgb::ZERO, 2.0, false);
+        let guided = m.square(f, 2.0, Rgb::ZERO, 2.0, true);
+        assert!((uniform - guided).abs() < 1e-9, "{uniform} {guided}");
+        assert!((uniform - 4.5 / 1.8).abs() < 1e-6);
+        assert_eq!(m.square(Rgb::ZERO, 0.0, Rgb::ZERO, 0.0, true), 0.0);
     }
 
     #[test]

@@ -109,7 +109,7 @@ impl PassContext<'_> {
     ) -> Result<Statistics, RenderError> {
         let pieces = self.pieces(pass);
         let mut total = Statistics::default();
-        let (mut pass, older) = (*pass, records.len());
+        let (mut pass, mut older) = (*pass, records.len());
         let (start, end) = pass.span;
         for (batch, work) in pieces.chunks(BATCH).enumerate() {
             let done: Vec<Option<Piece>> = self.pool.install(|| {
@@ -125,7 +125,11 @@ impl PassContext<'_> {
                 };
                 image.merge_weighted(&piece.sums, |_, _| pass.weight);
                 total.add(&piece.statistics);
-                records.append(&mut piece.records);
+                if !records.append(&mut piece.records, &mut older) {
+                    pass.record *= 0.5;
+                    pass.most_records = pass.most_records.min(records.len());
+                    total.short_of_memory = true;
+                }
             }
             while records.len() - older > pass.most_records {
                 records.thin(older, [older, (records.len() - older) / 2]);
@@ -235,19 +239,24 @@ impl PassContext<'_> {
         counts.paths_found += paths.found.iter().filter(|&&f| f).count() as u64;
         counts.non_finite += paths.non_finite;
         if pass.guide.is_some() {
-            let row_is_outside = |u: &[f32]| {
-                u[..columns.learned()]
+            for (i, u) in paths.u.chunks_exact(columns.width()).enumerate() {
+                let guided = mixture.is_guided(coins[i][0]);
+                statistics.guided += u64::from(guided);
+                statistics.squares[usize::from(guided)].paths += 1;
+                if u[..columns.learned()]
                     .iter()
-                    .any(|x| !(0.0..1.0).contains(x))
-            };
-            counts.outside += paths
-                .u
-                .chunks_exact(columns.width())
-                .filter(|u| row_is_outside(u))
-                .count() as u64;
+                    .all(|x| (0.0..1.0).contains(x))
+                {
+                    statistics.weights += f64::from(mixture.weight(paths.q_nee[i]));
+                } else {
+                    counts.outside += 1;
+                }
+            }
+        } else {
+            statistics.weights += paths.len() as f64;
         }
         let [width, height] = film.crop_size().map(|n| n as f32);
-        for (i, &[_, thin]) in coins.iter().enumerate() {
+        for (i, &[coin, thin]) in coins.iter().enumerate() {
             let mut f = paths.f(i);
             let (mut estimate, weight) = mixture.divide(
                 paths.f_nee[i],
@@ -267,6 +276,17 @@ impl PassContext<'_> {
                 continue;
             }
             piece.statistics.add_estimate(estimate, weight);
+            if pass.guide.is_some() {
+                let guided = mixture.is_guided(coin);
+                let square = mixture.square(
+                    paths.f_nee[i],
+                    paths.q_nee[i],
+                    paths.f_bsdf[i],
+                    paths.q_bsdf[i],
+                    guided,
+                );
+                piece.statistics.squares[usize::from(guided)].add_value(square);
+            }
             if thin < pass.record {
                 let [x, y] = paths.film[i];
                 piece.records.push(

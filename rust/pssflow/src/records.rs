@@ -125,7 +125,44 @@ impl PathRecords {
         ]
     }
 
-    pub(crate) fn append(&mut self, other: &mut Self) {
+    /// Makes room for so many more, and says whether there was any: a plain vector would end the process.
+    fn has_room_for(&mut self, other: &Self) -> bool {
+        let more = other.len();
+        let mut room = self.u.try_reserve(other.u.len()).is_ok();
+        for numbers in self.numbers() {
+            room = room && numbers.try_reserve(more).is_ok();
+        }
+        room && self.contexts.try_reserve(other.contexts.len()).is_ok()
+            && self.ray.try_reserve(other.ray.len()).is_ok()
+            && self.pixel.try_reserve(more).is_ok()
+    }
+
+    /// Takes over the paths of `other`, of which the first `older` of all came before this pass. Where memory does not
+    /// suffice, half of the paths so far give way, and `false` comes back: fewer should be kept from here on.
+    pub(crate) fn append(&mut self, other: &mut Self, older: &mut usize) -> bool {
+        let mut enough = true;
+        while !self.has_room_for(other) {
+            enough = false;
+            let kept = [*older / 2, (self.len() - *older) / 2];
+            self.thin(*older, kept);
+            *older = kept[0];
+            if self.len() == 0 {
+                // Not even these few fit; without records there is nothing to learn, and the image goes on.
+                other.clear();
+            }
+        }
+        self.take(other);
+        enough
+    }
+
+    fn clear(&mut self) {
+        *self = Self {
+            drawn: self.drawn,
+            ..Self::default()
+        };
+    }
+
+    fn take(&mut self, other: &mut Self) {
         self.u.append(&mut other.u);
         self.f.append(&mut other.f);
         self.f_bsdf.append(&mut other.f_bsdf);

@@ -95,6 +95,7 @@ impl Run<'_> {
         if let (Some((mut outcome, apart)), Some(time)) = (held, time) {
             if self.options.combine == Combine::Variance {
                 outcome.film = self.develop(apart);
+                outcome.diagnostics.see(&outcome.film);
             }
             self.snapshots.taken.push(Snapshot { time, outcome });
         }

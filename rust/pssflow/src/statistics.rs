@@ -3,6 +3,8 @@
 use pss_render::math::{Rgb, luminance};
 use serde::Serialize;
 
+use crate::tail::Tail;
+
 /// Paths of one kind: the pilot's, or those rendered after it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct Counts {
@@ -39,11 +41,63 @@ impl Counts {
     }
 }
 
+/// A sum over paths and the sum of its squares; zeros count in `paths` alone.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Moments {
+    /// Paths, those without light included.
+    pub paths: u64,
+    /// Σx
+    pub sum: f64,
+    /// Σx²
+    pub sum_2: f64,
+}
+
+impl Moments {
+    #[inline]
+    pub(crate) fn add_value(&mut self, x: f64) {
+        self.sum += x;
+        self.sum_2 += x * x;
+    }
+
+    pub(crate) fn add(&mut self, other: &Self) {
+        self.paths += other.paths;
+        self.sum += other.sum;
+        self.sum_2 += other.sum_2;
+    }
+
+    /// Mean over paths; 0 where there are none.
+    pub fn mean(&self) -> f64 {
+        self.sum / (self.paths as f64).max(1.0)
+    }
+
+    /// Mean of squares over paths; 0 where there are none.
+    pub fn mean_square(&self) -> f64 {
+        self.sum_2 / (self.paths as f64).max(1.0)
+    }
+
+    /// Variance of the mean, as far as the paths tell.
+    pub fn variance_of_mean(&self) -> f64 {
+        let (n, mean) = ((self.paths as f64).max(1.0), self.mean());
+        (self.sum_2 / n - mean * mean).max(0.0) / n
+    }
+}
+
 /// Counts and weights of a set of paths.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Debug, Default)]
 pub struct Statistics {
     /// Counts.
     pub counts: Counts,
+    /// Paths whose coin fell on the guide.
+    pub guided: u64,
+    /// Σ 1/m over all paths whose numbers lie in the cube, with or without light: 1 a path on average where the guide's
+    /// densities are right and m > 0 everywhere.
+    pub weights: f64,
+    /// f²/m of a guided pass by its uniform paths, and by its guided ones (divided by q, too).
+    pub squares: [Moments; 2],
+    /// The largest lum(f/m).
+    pub tail: Tail,
+    /// Whether memory for the paths to learn from ran out, so that fewer were kept.
+    pub short_of_memory: bool,
     /// Largest 1/m of a path that carries light.
     pub max_weight: f32,
     /// Largest luminance of f/m.
@@ -59,6 +113,7 @@ impl Statistics {
     pub(crate) fn add_estimate(&mut self, estimate: Rgb, weight: f32) {
         let y = luminance(estimate);
         self.counts.nonzero += 1;
+        self.tail.add(y);
         self.max_weight = self.max_weight.max(weight);
         self.max_estimate = self.max_estimate.max(y);
         self.sum += f64::from(y);
@@ -68,10 +123,31 @@ impl Statistics {
     /// Adds another set.
     pub(crate) fn add(&mut self, other: &Self) {
         self.counts.add(&other.counts);
+        self.guided += other.guided;
+        self.weights += other.weights;
+        for (own, other) in self.squares.iter_mut().zip(&other.squares) {
+            own.add(other);
+        }
+        self.tail.merge(&other.tail);
+        self.short_of_memory |= other.short_of_memory;
         self.max_weight = self.max_weight.max(other.max_weight);
         self.max_estimate = self.max_estimate.max(other.max_estimate);
         self.sum += other.sum;
         self.sum_2 += other.sum_2;
+    }
+
+    /// Mean 1/m over all paths.
+    pub fn mean_weight(&self) -> f64 {
+        self.weights / (self.counts.camera_rays as f64).max(1.0)
+    }
+
+    /// Lum(f/m) as a sum over all paths.
+    pub fn estimates(&self) -> Moments {
+        Moments {
+            paths: self.counts.camera_rays,
+            sum: self.sum,
+            sum_2: self.sum_2,
+        }
     }
 
     /// Kish's effective sample size of the contributions, (Σc)² ÷ Σc².

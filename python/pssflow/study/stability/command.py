@@ -1,0 +1,179 @@
+"""`pssflow study stability`: every planted failure with every guide; a table and a chart of what holds."""
+
+from __future__ import annotations
+
+import dataclasses
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from ...params import Text
+from ...terminal import Terminal
+
+if TYPE_CHECKING:
+    from .case import Case, Effort, Finding
+    from .measure import Bench
+
+__all__ = ["stability"]
+
+
+class Names(Text):
+    """Names joined by commas."""
+
+    name = "names"
+
+    def read(self, text: str) -> tuple[str, ...]:
+        """The names; which there are is checked when they are looked up."""
+        names = tuple(part.strip() for part in text.split(","))
+        if not all(names):
+            raise ValueError(f"{text!r} are no names; expected some, joined by commas")
+        return names
+
+
+@click.command("stability")
+@click.option("--cases", type=Names(), help="Names or numbers, by commas.  [default: all]")
+@click.option("--guides", type=Names(), help="By commas; thesis is its method.  [default: eight]")
+@click.option("--seeds", type=click.IntRange(2, 1000), default=8, show_default=True)
+@click.option("--spp", type=click.IntRange(2, 4096), default=64, show_default=True)
+@click.option(
+    "--side", type=click.IntRange(2, 512), default=16, show_default=True, help="Of a film, pixels."
+)
+@click.option("--quick", is_flag=True, help="A setting a case, tiny films, short training: a look.")
+@click.option("--pictures", metavar="DIR", help="Also writes a strip of images for each case.")
+@click.option("--threads", type=click.IntRange(1, 4096), help="[default: one a core]")
+@click.option("-o", "--output", default="out/study-stability", show_default=True, metavar="DIR")
+@click.option("-q", "--quiet", is_flag=True, help="No progress, no notices.")
+@click.pass_obj
+def stability(
+    terminal: Terminal,
+    cases: tuple[str, ...] | None,
+    guides: tuple[str, ...] | None,
+    seeds: int,
+    spp: int,
+    side: int,
+    quick: bool,
+    pictures: str | None,
+    threads: int | None,
+    output: str,
+    quiet: bool,
+) -> None:
+    """Planted failures × guides: what holds, what degrades, what fails, each with its figure.
+
+    Writes results.csv, summary.md and a chart to DIR; run again, it goes on where it stopped.
+    """
+    # Mitsuba takes a second to import, and --help should not.
+    from ...guide import choose
+    from ...output import make_folder
+    from ..store import configuration
+    from .case import QUICK, THESIS, Effort
+    from .registry import CASES, STANDARD
+    from .results import Row, Rows, publish
+
+    terminal.quiet = quiet
+    chosen = list(CASES.values())
+    if cases is not None:
+        known = {str(case.number): case for case in chosen} | dict(CASES)
+        if unknown := [name for name in cases if name not in known]:
+            raise ValueError(f"there is no case {unknown[0]!r}; there are {', '.join(CASES)}")
+        chosen = [known[name] for name in cases]
+    names = guides or STANDARD
+    for name in names:
+        if name != THESIS:
+            choose(name, {})
+    effort = Effort(seeds=seeds, spp=spp, side=side, threads=threads)
+    if quick:
+        effort = dataclasses.replace(QUICK, seeds=min(seeds, 4), threads=threads)
+    _variant()
+    folder = make_folder(output)
+    strips = make_folder(pictures) if pictures else None
+    store = Rows(folder / "results.csv")
+    rows: list[Row] = []
+    done, total = 0, len(chosen) * len(names)
+    titles = {case.name: f"{case.number}. {case.title}" for case in chosen}
+    heading = (
+        f"Planted failures: light of exactly 2 bounces, {effort.seeds} seeds, {effort.spp} spp in all (pilot inside) "
+        f"where no case says otherwise, {effort.side} × {effort.side} pixels"
+    )
+    try:
+        for case in chosen:
+            benches: dict[str, Bench] = {}
+            found: dict[str, Finding] = {}
+            for guide in names:
+                done += 1
+                key = configuration(
+                    case=[case.name, case.what, [s.name for s in case.settings]],
+                    guide=guide,
+                    effort={**dataclasses.asdict(effort), "threads": None},
+                    sources=_sources(),
+                )
+                row = store.find(key)
+                if row is None or strips is not None:
+                    terminal.say(f"[{done}/{total}] {case.number} {case.name}, {guide}")
+                    finding = _examine(case, guide, effort, benches)
+                    if finding is None:
+                        continue
+                    found[guide] = finding
+                    row = Row.of(case, guide, finding, effort, key)
+                    store.put(row)
+                rows.append(row)
+            if strips is not None and benches:
+                _strip(strips, case.name, titles[case.name], benches, found)
+    except KeyboardInterrupt:
+        if rows:
+            publish(folder, rows, names, titles, heading)
+        raise
+    if not rows:
+        raise ValueError("none of these guides has anything to do with these cases")
+    terminal.out.print(publish(folder, rows, names, titles, heading))
+
+
+def _variant() -> None:
+    """A variant for scenes from dictionaries, where none is set: films are small, and nothing need be compiled."""
+    import mitsuba as mi
+
+    if mi.variant() is None:
+        mi.set_variant("scalar_rgb")
+
+
+def _sources() -> str:
+    """Hash of the cases' own sources: an edited case is another one."""
+    import hashlib
+
+    texts = (path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))
+    return hashlib.sha256(b"".join(texts)).hexdigest()[:16]
+
+
+def _examine(case: Case, guide: str, effort: Effort, benches: dict[str, Bench]) -> Finding | None:
+    from .measure import measure
+
+    if case.settings:
+        return measure(case, guide, effort, benches)
+    if case.probe is None:
+        return None
+    with tempfile.TemporaryDirectory(prefix="pssflow-stability-") as scratch:
+        return case.probe(guide, effort, Path(scratch))
+
+
+def _strip(
+    folder: Path,
+    name: str,
+    title: str,
+    benches: dict[str, Bench],
+    found: dict[str, Finding],
+) -> None:
+    """Truth, random numbers and guides of a case's first setting, one seed each."""
+    from ..charts import strip
+
+    bench = next(iter(benches.values()))
+    truth = bench.truth.mean(axis=0)
+    if truth.ndim != 3 or min(truth.shape[:2]) < 4 or not truth.any():
+        return
+    images = [("truth", truth), ("random", bench.random[0].image)]
+    images += [
+        (guide, finding.image)
+        for guide, finding in found.items()
+        if finding.image is not None and finding.image.shape == truth.shape
+    ]
+    strip(folder / f"{name}.png", title, images)

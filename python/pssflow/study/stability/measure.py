@@ -1,0 +1,222 @@
+"""Renders a case's settings with a guide and with random numbers, and judges the one by the other.
+
+A guide *holds* where its images are finite and unbiased (Welch's test of the mean and of tiles against the truth), no
+path weighs more than 1/a, E[(f/m)²] ≤ E[f²]/a within its error, and its relMSE is at most 1.3 times that of as many
+random samples (median over seeds). It *degrades* where it is only slower, and *fails* where one of the others
+breaks, or where it is more than ten times slower: no mixture with a = .1 can be.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ... import metrics
+from ...files import first_line
+from ...render import Result
+from ...scene import Scene
+from ..welch import ALPHA, welch
+from .case import THESIS, Case, Effort, Finding, Setting, render_options, worst
+
+__all__ = ["HARMLESS", "Bench", "judge", "measure"]
+
+F32 = NDArray[np.float32]
+
+HARMLESS = 1.3
+"""Times the error of random numbers at equal samples that is no harm: a pilot that taught nothing costs a part."""
+
+HOPELESS = 10.0
+"""Times that error that no mixture with a ≥ .1 can reach, but for chance."""
+
+ERRORS = 4.0
+"""Standard errors that the measured bound may be exceeded by."""
+
+FIRST_SEED = 1000
+"""Of the renders; the truth counts from 0."""
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A setting's scene with its truth and its random renders."""
+
+    setting: Setting
+    scene: Scene
+    effort: Effort
+    truth: F32
+    """Runs, (n, h, w, 3)."""
+    random: list[Result]
+
+    @classmethod
+    def of(cls, setting: Setting, effort: Effort) -> Bench:
+        """Loads a setting's scene and renders what guides are compared with."""
+        effort = replace(effort, spp=setting.spp or effort.spp, side=setting.side or effort.side)
+        scene = Scene(setting.scene(effort.side))
+        many = {**setting.options, "threads": effort.threads, "progress": False}
+        if setting.truth is not None:
+            truth = setting.truth(effort.side, effort.truth, 16 * effort.spp, effort.threads)
+        else:
+            runs = [
+                scene.render("none", 16 * effort.spp, seed=seed, **many).image
+                for seed in range(effort.truth)
+            ]
+            truth = np.stack(runs)
+        random = [
+            scene.render("none", effort.spp, seed=FIRST_SEED + seed, **many)
+            for seed in range(effort.seeds)
+        ]
+        return cls(setting, scene, effort, truth, random)
+
+    def run(self, guide: str) -> list[Result]:
+        """A render of the guide for each seed."""
+        how = render_options(guide, self.effort, self.setting.guide_options)
+        how |= {**self.setting.options, "threads": self.effort.threads, "progress": False}
+        if guide == THESIS:
+            # Its emitter samples alone have another f where lights are hit by chance, but the same mean.
+            how.pop("emitter_strategy", None)
+        return [
+            self.scene.render(**how, spp=self.effort.spp, seed=FIRST_SEED + seed)
+            for seed in range(self.effort.seeds)
+        ]
+
+
+def measure(case: Case, guide: str, effort: Effort, benches: dict[str, Bench]) -> Finding:
+    """The worst of a case's settings for a guide; `benches` keeps what guides share, by setting."""
+    settings = case.settings if effort.extremes else case.settings[:1]
+    findings = []
+    for setting in settings:
+        if setting.name not in benches:
+            benches[setting.name] = Bench.of(setting, effort)
+        bench = benches[setting.name]
+        try:
+            found = judge(bench, bench.run(guide))
+        except (ValueError, RuntimeError, MemoryError) as error:
+            found = Finding("fails", first_line(error))
+        if len(settings) > 1:
+            found = replace(found, why="; ".join(t for t in (setting.name, found.why) if t))
+        findings.append(found)
+    return worst(findings)
+
+
+def judge(bench: Bench, results: Sequence[Result]) -> Finding:
+    """What the renders of one guide came to."""
+    images = np.stack([result.image for result in results])
+    last = results[-1].stats
+    first = results[0]
+    warnings = tuple(dict.fromkeys(w for r in results for w in r.stats["diagnostics"]["warnings"]))
+    ks = [k for r in results if (k := r.stats["diagnostics"]["pareto_k"]) is not None]
+    chosen = sorted({result.stats["chosen"] for result in results})
+    a = min(float(result.stats["a"]) for result in results)
+    numbers: dict[str, float | None] = {
+        "a": a,
+        "max_weight": max(float(r.stats["max_weight"]) for r in results),
+        "pareto_k": float(np.median(ks)) if ks else None,
+        "warned": sum(bool(r.stats["diagnostics"]["warnings"]) for r in results) / len(results),
+    }
+
+    def finding(verdict: str, figure: str, why: str = "") -> Finding:
+        said = [why] if why else []
+        if last["guide"] == "auto":
+            said.append("chose " + ", ".join(chosen))
+        said += [n for n in dict.fromkeys(last["notes"]) if "none is used" in n or "diverged" in n]
+        return Finding(verdict, figure, "; ".join(said), numbers, warnings, first.image)
+
+    bad = int(np.count_nonzero(~np.isfinite(images)))
+    if bad:
+        return finding("fails", f"{bad} values of the image are not finite")
+    truth = bench.truth.mean(axis=0)
+    if not truth.any():
+        lit = float(np.abs(images).max())
+        return finding(
+            "holds" if lit == 0 else "fails",
+            "black, as it should be" if lit == 0 else f"{lit:g} in a black image",
+        )
+    numbers |= _errors(bench, images)
+    numbers["bound"], error = _bound(bench, results, a)
+    numbers["bound_error"] = error
+    if a > 0 and (weight := numbers["max_weight"]) is not None and weight > (1 + 1e-5) / a:
+        return finding("fails", f"a path weighs {weight:.4g} > 1/a = {1 / a:.4g}")
+    figure = _figure(numbers)
+    if a == 0 and (z := _missing(results)) < -ERRORS:
+        what = f"light is missing: {z:.0f} standard errors below the pilot's mean; {figure}"
+        return finding("fails", what)
+    heavy, p = _bias(bench, images)
+    numbers["p"] = p
+    # Of a mode that a few paths in all runs meet, their spread says nothing of the variance.
+    if p < ALPHA / 2 and not bench.setting.blind:
+        there, here = float(truth.mean()), float(images.mean())
+        what = f"{figure}; mean {here / there:.3g} of the truth, p = {p:.1g}"
+        # Where one sample holds much of the sum, neither side knows its variance, and p says little.
+        if not heavy:
+            return finding("fails", what)
+        return finding("degrades", what, "too heavy-tailed to tell bias from noise")
+    bound = numbers["bound"]
+    if a > 0 and bound is not None and bound - ERRORS * error > 1.0:
+        return finding("fails", f"E[(f/m)²] = {bound:.3g} · E[f²]/a")
+    ratio = numbers["ratio"] or 0.0
+    if ratio > HOPELESS:
+        return finding("fails", figure)
+    if ratio <= HARMLESS:
+        return finding("holds", figure)
+    silent = bench.setting.blind and (numbers["warned"] or 0.0) < 0.5
+    return finding("degrades", figure, "most renders say nothing of it" if silent else "")
+
+
+def _errors(bench: Bench, images: F32) -> dict[str, float | None]:
+    """RelMSE of guide and random numbers, medians over the seeds, and how far outliers stand out."""
+    truth = bench.truth.mean(axis=0)
+    variance = bench.truth.var(axis=0, ddof=1) / len(bench.truth)
+    ours = np.array([metrics.relmse(image, truth, variance) for image in images])
+    theirs = np.array([metrics.relmse(r.image, truth, variance) for r in bench.random])
+    # A truth's own noise can leave less than nothing of a small error.
+    least = max(metrics.relative_variance(variance, truth), 1e-12)
+    middle = [max(float(np.median(side)), least) for side in (ours, theirs)]
+    return {
+        "relmse": middle[0],
+        "relmse_random": middle[1],
+        "ratio": middle[0] / middle[1],
+        "outlier": float(ours.max()) / middle[0],
+    }
+
+
+def _bound(bench: Bench, results: Sequence[Result], a: float) -> tuple[float | None, float]:
+    """The ratio a · E[(f/m)²] ÷ E[f²], and its standard error from the spread between seeds."""
+    ours = np.array([r.stats["diagnostics"]["mean_square"] for r in results], np.float64)
+    theirs = np.array([r.stats["diagnostics"]["mean_square"] for r in bench.random], np.float64)
+    if (
+        theirs.mean() <= 0.0
+        or bench.random[0].stats["emitter_strategy"] != results[0].stats["emitter_strategy"]
+    ):
+        return None, 0.0
+    spread = [
+        side.std(ddof=1) / math.sqrt(len(side)) / max(side.mean(), 1e-300)
+        for side in (ours, theirs)
+    ]
+    ratio = a * ours.mean() / theirs.mean()
+    return float(ratio), float(ratio * math.hypot(*spread))
+
+
+def _bias(bench: Bench, images: F32) -> tuple[bool, float]:
+    """Whether tails are too heavy for the test, and Welch's p of the means of image and tiles."""
+    compared = welch(images, bench.truth, tile=max(images.shape[1] // 2, 1))
+    return not compared.has_power, compared.p
+
+
+def _missing(results: Sequence[Result]) -> float:
+    """Standard errors by which guided paths carry less light than the pilot's; the median of the renders."""
+    means = [r.stats["diagnostics"]["means"] for r in results]
+    return float(np.median([m["z"] if m else 0.0 for m in means]))
+
+
+def _figure(numbers: dict[str, Any]) -> str:
+    weight = numbers["max_weight"]
+    text = f"relMSE {numbers['ratio']:.2g} × random's, max 1/m {weight:.3g}"
+    if numbers.get("bound") is not None and numbers["a"] > 0:
+        text += f", a·E[(f/m)²]/E[f²] {numbers['bound']:.2g} ± {numbers['bound_error']:.1g}"
+    if numbers["outlier"] > 5:
+        text += f", worst seed {numbers['outlier']:.2g} × median"
+    return text

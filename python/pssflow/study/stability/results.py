@@ -1,0 +1,215 @@
+"""results.csv of the stability study: a row for each case and guide, and the table and chart that are made of them."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+from collections.abc import Sequence
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from ... import _core
+from ...files import first_line, write_beside
+from ...report import markdown_table
+from ..charts import VERDICT_COLOURS, verdict_chart
+from ..store import commit, processor
+from .case import Case, Effort, Finding
+
+__all__ = ["Row", "Rows", "publish"]
+
+STYLES = {"holds": "green", "degrades": "yellow", "fails": "red"}
+
+FIGURES = ("ratio", "bound", "bound_error", "max_weight", "p", "outlier", "pareto_k", "warned")
+"""Numbers of a finding that have a column."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """What a guide made of a case."""
+
+    number: int
+    case: str
+    guide: str
+    verdict: str
+    figure: str
+    why: str
+    warnings: str
+    ratio: str
+    """relMSE ÷ that of random numbers at equal samples, medians over seeds."""
+    bound: str
+    """a · E[(f/m)²] ÷ E[f²]."""
+    bound_error: str
+    max_weight: str
+    p: str
+    """Welch's, of image and tiles."""
+    outlier: str
+    """The worst seed's relMSE ÷ the median."""
+    pareto_k: str
+    warned: str
+    """Share of the renders that warn."""
+    seeds: int
+    spp: int
+    side: int
+    configuration: str
+    commit: str
+    version: str
+    processor: str
+    when: str
+
+    @classmethod
+    def of(cls, case: Case, guide: str, found: Finding, effort: Effort, configuration: str) -> Row:
+        """A finding as a row."""
+        numbers = {name: _text(found.numbers.get(name)) for name in FIGURES}
+        return cls(
+            number=case.number,
+            case=case.name,
+            guide=guide,
+            verdict=found.verdict,
+            figure=found.figure,
+            why=found.why,
+            warnings=" | ".join(found.warnings),
+            **numbers,
+            seeds=effort.seeds,
+            spp=effort.spp,
+            side=effort.side,
+            configuration=configuration,
+            commit=commit(),
+            version=_core.__version__,
+            processor=processor(),
+            when=datetime.now(timezone.utc).strftime("%Y-%m-%dT%H:%M:%SZ"),
+        )
+
+
+class Rows:
+    """The rows of one file, rewritten whole after each finding.
+
+    Raises:
+        ValueError: the file is there, but is none of ours.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.rows: list[Row] = []
+        if not path.exists():
+            return
+        try:
+            with path.open(newline="", encoding="utf-8") as file:
+                for texts in csv.DictReader(file):
+                    values: dict[str, Any] = {
+                        f.name: texts[f.name] for f in dataclasses.fields(Row)
+                    }
+                    for name in ("number", "seeds", "spp", "side"):
+                        values[name] = int(values[name])
+                    self.rows.append(Row(**values))
+        except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
+            raise ValueError(
+                f"{path}: is no table of this version of pssflow ({first_line(error)}); "
+                "move it away, or choose another folder"
+            ) from None
+
+    def find(self, configuration: str) -> Row | None:
+        """The row of a configuration, if there is one."""
+        return next((row for row in self.rows if row.configuration == configuration), None)
+
+    def put(self, new: Row) -> None:
+        """Writes a row in place of that of the same case and guide.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
+        others = [row for row in self.rows if (row.case, row.guide) != (new.case, new.guide)]
+        self.rows = sorted([*others, new], key=lambda row: row.number)
+
+        def write(part: Path) -> None:
+            with part.open("w", newline="", encoding="utf-8") as file:
+                names = [field.name for field in dataclasses.fields(Row)]
+                writer = csv.DictWriter(file, names, lineterminator="\n")
+                writer.writeheader()
+                writer.writerows(dataclasses.asdict(row) for row in self.rows)
+
+        write_beside(self.path, write)
+
+
+def publish(
+    folder: Path, rows: Sequence[Row], guides: Sequence[str], titles: dict[str, str], heading: str
+) -> Table:
+    """Writes summary.md and the chart, and returns the table for the console.
+
+    Raises:
+        OSError: a file cannot be written.
+    """
+    cases = list(dict.fromkeys(row.case for row in rows))
+    cells = {(row.case, row.guide): row for row in rows}
+    shown = Table(title=heading)
+    shown.add_column("case")
+    for guide in guides:
+        shown.add_column(guide)
+    for case in cases:
+        texts = [titles[case]]
+        for guide in guides:
+            row = cells.get((case, guide))
+            texts.append(
+                "–" if row is None else f"[{STYLES[row.verdict]}]{row.verdict}[/] {_short(row)}"
+            )
+        shown.add_row(*texts)
+    grid = {
+        (titles[case], guide): (row.verdict, _short(row)) for (case, guide), row in cells.items()
+    }
+    names = [titles[case] for case in cases]
+    verdict_chart(folder / "stability.png", heading, names, guides, grid, CAPTION)
+    counts = [
+        [
+            guide,
+            *(str(sum(r.verdict == v for r in rows if r.guide == guide)) for v in VERDICT_COLOURS),
+        ]
+        for guide in guides
+    ]
+    lines = [
+        f"# {heading}",
+        CAPTION,
+        markdown_table(
+            ["case", *guides],
+            [
+                [titles[case], *(_cell(cells.get((case, guide))) for guide in guides)]
+                for case in cases
+            ],
+            texts=1 + len(guides),
+        ),
+        markdown_table(["guide", *VERDICT_COLOURS], counts),
+        "## Figures",
+        markdown_table(
+            ["case", "guide", "verdict", "figure", "beside"],
+            [[titles[r.case], r.guide, r.verdict, r.figure, _beside(r)] for r in rows],
+            texts=5,
+        ),
+    ]
+    text = "\n\n".join(lines) + "\n"
+    write_beside(folder / "summary.md", lambda part: part.write_text(text, encoding="utf-8"))
+    return shown
+
+
+CAPTION = (
+    "Numbers are relMSE ÷ that of as many random samples (medians over seeds). Holds: finite, unbiased, no weight "
+    "above 1/a, at most 1.3. Degrades: safe, but slower. Fails: biased, unbounded, not finite, or more than ten times "
+    "slower. "
+    "thesis: a = 0; all others with the guide's own share a of random numbers."
+)
+
+
+def _short(row: Row) -> str:
+    return f"{float(row.ratio):.2g}" if row.ratio else ""
+
+
+def _cell(row: Row | None) -> str:
+    return "–" if row is None else f"{row.verdict} {_short(row)}".strip()
+
+
+def _beside(row: Row) -> str:
+    return "; ".join(part for part in (row.why, row.warnings.replace("|", "/")) if part)
+
+
+def _text(value: float | None) -> str:
+    return "" if value is None else f"{value:.6g}"

@@ -1,0 +1,68 @@
+"""Damaged guide files and wild options: a guide or an image, or one clear line; no crash, no hang.
+
+Each case runs in a forked worker with a time limit, as those of `test_border.py` do. The long tier has 24,000.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import pytest
+
+from tests.conftest import SCALAR
+from tests.support.border import Answer, Case
+from tests.support.guides import SMALL, guide_file, options, write_guides
+from tests.support.workers import run_cases
+
+QUICK = 150
+ALL = 12_000
+SECONDS = 30.0
+
+KINDS: dict[str, Callable[..., Answer]] = {"guide files": guide_file, "options": options}
+
+
+def _check(kind: str, seeds: range, folder: Path) -> Counter[str]:
+    mi.set_variant(SCALAR)
+    write_guides(folder)
+    cases = [Case(str(folder), seed) for seed in seeds]
+    counts: Counter[str] = Counter()
+    bad = []
+    for outcome in run_cases(KINDS[kind], cases, seconds=SECONDS):
+        if outcome.death:
+            bad.append(f"{outcome.case.seed}: {outcome.death} while in {outcome.stage!r}")
+        elif outcome.answer.kind == "bad":
+            bad.append(f"{outcome.case.seed}: {outcome.answer.text}")
+        else:
+            counts[outcome.answer.kind] += 1
+    assert not bad, f"{len(bad)} of {len(cases)} {kind}:\n" + "\n".join(bad[:20])
+    assert counts.total() == len(cases)
+    return counts
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_wild_guides_are_told_in_one_line(
+    kind: str, tmp_path: Path, record: dict[str, Any]
+) -> None:
+    counts = _check(kind, range(QUICK), tmp_path)
+    record |= dict(counts)
+    assert counts["refused"] > QUICK / 5
+    assert counts["rendered"] > QUICK / 50
+
+
+def test_whole_guides_render(tmp_path: Path) -> None:
+    """Or the damaged ones would be refused for a reason that is none of theirs."""
+    whole = range(-len(SMALL), 0)
+    assert _check("guide files", whole, tmp_path)["rendered"] == len(SMALL)
+
+
+@pytest.mark.long
+@pytest.mark.timeout(7200)
+@pytest.mark.parametrize("kind", KINDS)
+def test_very_many_wild_guides_are_told_in_one_line(
+    kind: str, tmp_path: Path, record: dict[str, Any]
+) -> None:
+    record |= dict(_check(kind, range(QUICK, QUICK + ALL), tmp_path))

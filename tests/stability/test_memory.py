@@ -1,0 +1,122 @@
+"""Memory: flat over many renders in one process, and a clear word where it runs out while learning."""
+
+from __future__ import annotations
+
+import os
+import resource
+import time
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import pssflow
+from pssflow.guide import registry
+from pssflow.study.stability.life import in_a_worker
+from pssflow.study.stability.parts import room
+from pssflow.study.stability.registry import CASES
+from tests.conftest import SCALAR
+
+SOAK = "PSSFLOW_SOAK_SECONDS"
+"""Environment variable: how long the soak goes on. Default: half an hour."""
+
+SHORT: dict[str, dict[str, Any]] = {
+    "realnvp": {"epochs": 1, "samples": 1024},
+    "realnvp-logit": {"epochs": 1, "samples": 1024},
+    "mixture-net": {"epochs": 1},
+    "spline-net": {"epochs": 1},
+}
+
+
+def _resident() -> int:
+    """Bytes of this process that are in memory."""
+    with Path("/proc/self/statm").open(encoding="ascii") as file:
+        return int(file.read().split()[1]) * resource.getpagesize()
+
+
+def _growth(renders: int) -> int:
+    """Bytes that this process grew by over the second half of so many renders."""
+    mi.set_variant(SCALAR)
+    scene = pssflow.Scene(room(32))
+    guides = ["none", "auto", "table", "vegas", "mixture-net"]
+    middle = 0
+    for i in range(renders):
+        name = guides[i % len(guides)]
+        scene.render(name, 16, seed=i, threads=2, progress=False, **SHORT.get(name, {}))
+        if i == renders // 2:
+            middle = _resident()
+    return _resident() - middle
+
+
+def test_memory_is_flat() -> None:
+    """Thirty renders behind thirty others: one leaked image of each (50 kB), or its records, would be seen."""
+    assert _growth(60) < 4 << 20
+
+
+@pytest.mark.long
+@pytest.mark.timeout(1800)
+def test_memory_is_flat_over_a_thousand_renders(record: dict[str, Any]) -> None:
+    record["bytes"] = float(_growth(1000))
+    assert record["bytes"] < 8 << 20
+
+
+def test_memory_that_runs_out_while_learning_is_no_crash() -> None:
+    """The records of 8 million paths do not fit: fewer are kept, the image is whole, and a note says so."""
+    answer = in_a_worker(_learn_in_little, 96 << 20)
+    assert answer == "fewer were kept"
+
+
+def _learn_in_little(more: int) -> str:
+    mi.set_variant(SCALAR)
+    scene = pssflow.Scene(room(512))
+    with Path("/proc/self/statm").open(encoding="ascii") as file:
+        used = int(file.read().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + more, used + more))
+    result = scene.render("table", 8, pilot_spp=4, threads=1, progress=False, memory_mib=4)
+    if not np.isfinite(result.image).all():
+        return "not finite"
+    kept = any("memory was short" in note for note in result.notes)
+    return "fewer were kept" if kept else "it fitted"
+
+
+@pytest.mark.long
+@pytest.mark.timeout(0)
+def test_soak(record: dict[str, Any]) -> None:
+    """Renders of random cases, guides and options until the time is over: finite, and memory does not grow."""
+    mi.set_variant(SCALAR)
+    seconds = float(os.environ.get(SOAK, "1800"))
+    rng = np.random.default_rng(7)
+    names = ["none", "auto", "table", *registry()]
+    scenes = [setting.scene for case in CASES.values() for setting in case.settings]
+    start, renders, middle = time.perf_counter(), 0, 0
+    while (elapsed := time.perf_counter() - start) < seconds:
+        if not middle and elapsed > seconds / 2:
+            middle = _resident()
+        name = names[rng.integers(len(names))]
+        options = {
+            "k": int(rng.integers(1, 5)),
+            "emitter_strategy": ["mis", "nee", "auto"][rng.integers(3)],
+            "parametrisation": ["bsdf", "cosine", "uniform"][rng.integers(3)],
+            "combine": ["samples", "variance"][rng.integers(2)],
+            "uniform_fraction": [None, 0.1, 0.5, 1.0][rng.integers(4)],
+        }
+        side = int(rng.integers(1, 40))
+        scene = scenes[rng.integers(len(scenes))](side)
+        result = pssflow.render(
+            scene,
+            name,
+            int(rng.integers(2, 64)),
+            seed=renders,
+            progress=False,
+            **options,
+            **SHORT.get(name, {}),
+        )
+        assert np.isfinite(result.image).all(), (name, options)
+        assert (result.image >= 0).all(), (name, options)
+        renders += 1
+    record["renders"] = float(renders)
+    record["bytes"] = float(_resident() - middle)
+    assert renders > 0
+    assert record["bytes"] < 64 << 20
