@@ -77,8 +77,13 @@ in every call of ``render``: expect no gain at few samples, nor in easy scenes, 
 
 Paths are traced by pssflow's core, not by Mitsuba, in ``scalar_rgb`` and ``llvm_ad_rgb``; other variants know no such
 plugin. The scene is read anew in each call, edits through ``mi.traverse`` included, and may hold only what ``pssflow
-info`` calls supported. Alpha is 1 everywhere. Nothing is differentiated: gradients raise an error. Attribute ``result``
-keeps the last ``pssflow.Result``: variance, statistics, the guide.
+info`` calls supported. Alpha is 1 everywhere. Attribute ``result`` keeps the last ``pssflow.Result``: variance,
+statistics, the guide.
+
+In ``llvm_ad_rgb`` it is differentiable: after ``mi.render(scene, params, …)`` come ``dr.backward`` or ``dr.forward``.
+The guides of that render draw paths with a seed of their own, ``spp_grad`` a pixel for each length, and Dr.Jit evaluates
+BSDFs, textures and emitters along them. Parameters that move geometry, or that belong to delta lobes, are refused by
+name, and so are hidden emitters and a sun beside a sky.
 
 .. tabs::
     .. code-tab:: xml
@@ -103,9 +108,11 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .. import gradients
 from .. import guide as guides
 from ..export.walk import is_scalar
 from ..light import check_depth, render_light
@@ -191,13 +198,46 @@ def define() -> Callable[[Any], Any]:
             _fill(camera.film(), self.result, self.aov_names())
             return camera.film().develop() if develop else mi.TensorXf()
 
-        def render_forward(self, *_args: Any, **_kwargs: Any) -> Any:
-            """Raises: there are no derivatives."""
-            raise NotImplementedError(NO_GRADIENTS)
+        def render_forward(
+            self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0
+        ) -> Any:
+            """The image's derivative along the parameters' gradients; see `pssflow.gradients`."""
+            camera, drawn = self._to_differentiate(scene, params, sensor, spp)
+            with dr.suspend_grad():
+                return gradients.forward(*drawn[:2], camera, _scalar(seed), *drawn[2:])
 
-        def render_backward(self, *_args: Any, **_kwargs: Any) -> None:
-            """Raises: there are no derivatives."""
-            raise NotImplementedError(NO_GRADIENTS)
+        def render_backward(
+            self,
+            scene: Any,
+            params: Any,
+            grad_in: Any,
+            sensor: Any = 0,
+            seed: Any = 0,
+            spp: int = 0,
+        ) -> None:
+            """Adds the gradients of the parameters to what they have; see `pssflow.gradients`."""
+            camera, drawn = self._to_differentiate(scene, params, sensor, spp)
+            with dr.suspend_grad():
+                gradients.backward(*drawn[:2], camera, grad_in, _scalar(seed), *drawn[2:])
+
+        def _to_differentiate(
+            self, scene: Any, params: Any, sensor: Any, spp: int
+        ) -> tuple[Any, tuple[Scene, Result, int, str]]:
+            """The camera, and what is drawn from: scene, render, samples per pixel, parametrisation."""
+            if is_scalar():
+                raise NotImplementedError(NO_GRADIENTS)
+            gradients.check_parameters(scene, params)
+            camera = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            if self.aovs:
+                raise ValueError("gradients are not supported with `aovs`")
+            ours = Scene(
+                scene, camera, hide_emitters=self.hide_emitters, approximate=self.approximate
+            )
+            if self.result is None:
+                self.render(scene, camera, spp=spp)
+            assert self.result is not None
+            samples = int(spp) or self.arguments.get("spp") or camera.sampler().sample_count()
+            return camera, (ours, self.result, samples, self.result.stats["parametrisation"])
 
         def aov_names(self) -> list[str]:
             """With `max_depth` and `aovs` a name for each channel of `result`'s layers; else none."""
@@ -229,7 +269,7 @@ def define() -> Callable[[Any], Any]:
     return PssflowIntegrator
 
 
-NO_GRADIENTS = "integrator pssflow: it has no derivatives; differentiate with Mitsuba's `prb`"
+NO_GRADIENTS = "integrator pssflow: scalar variants have no derivatives; use llvm_ad_rgb"
 
 
 def _guide_options(props: Any, guide: str) -> dict[str, Any]:

@@ -289,7 +289,8 @@ impl<'a> Tracer<'a> {
             if let Some(steps) = &mut paths.steps {
                 steps.scattered[lane as usize * self.columns.k() + b - 1] = Step::new(wo, &sample);
             }
-            if state.throughput.max_element() <= 0.0 {
+            // A path that reflects nothing has a derivative all the same.
+            if state.throughput.max_element() <= 0.0 && paths.steps.is_none() {
                 continue;
             }
             state.ray = state.si.spawn_ray(wo);
@@ -384,7 +385,7 @@ impl<'a> Tracer<'a> {
                 1.0
             };
             let f = state.throughput * bsdf_value * light.radiance * (weight / p_nee);
-            if f == Rgb::ZERO {
+            if f == Rgb::ZERO && paths.steps.is_none() {
                 continue;
             }
             let join = Join {
@@ -420,7 +421,7 @@ impl<'a> Tracer<'a> {
                 continue;
             };
             let throughput = state.throughput * sample.weight;
-            if throughput.max_element() <= 0.0 {
+            if throughput.max_element() <= 0.0 && paths.steps.is_none() {
                 continue;
             }
             let wo = state.frame.to_world(sample.wo);
