@@ -78,7 +78,8 @@ BOUNCE = ("emitter.0", "emitter.1", "lobe", "direction.0", "direction.1", "roule
 COLUMNS: dict[str, tuple[str, ...]] = {
     "PathIntegrator": BOUNCE,
     "PRBIntegrator": BOUNCE,
-    "DirectIntegrator": BOUNCE[:-1],
+    # Two arguments of one call in C++: the compiler evaluates the last one first.
+    "DirectIntegrator": (*BOUNCE[:2], *BOUNCE[3:5], "lobe"),
     "BasicPRBIntegrator": BOUNCE[2:5],
 }
 """What the numbers of a bounce decide, in the order in which LLVM variants draw them, by class. `DirectIntegrator` has one
@@ -300,15 +301,20 @@ def define() -> Callable[[Any], Any]:
             value = radiance * ray_weight
             value = dr.select(dr.all(dr.isfinite(value)), value, 0.0)
             estimate = value / mi.Float(m)
-            at = corner if film.rfilter().is_box_filter() else corner + offset
-            at = (at + np.array(film.crop_offset())).astype(np.float32)
             alpha = dr.select(valid, mi.Float(1.0), mi.Float(0.0))
             channels = [estimate.x, estimate.y, estimate.z]
             if block.channel_count() == 5:
                 channels.append(alpha)
+            channels.append(dr.ones(mi.Float, lanes))
+            if film.rfilter().is_box_filter():
+                # Summed by pixel in a fixed order: lanes that add to one pixel at once would round as they come.
+                channels = [dr.block_sum(c, spp) for c in channels]
+                at = corner[::spp]
+            else:
+                at = corner + offset
+            at = (at + np.array(film.crop_offset())).astype(np.float32)
             block.put(
-                mi.Point2f(mi.Float(at[:, 0]), mi.Float(at[:, 1])),
-                [c * weight for c in channels] + [mi.Float(weight)],
+                mi.Point2f(mi.Float(at[:, 0]), mi.Float(at[:, 1])), [c * weight for c in channels]
             )
             rgb = np.array(value, np.float32).reshape(3, -1)
             dr.eval(block.tensor())
