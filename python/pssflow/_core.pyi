@@ -134,6 +134,35 @@ class Scene:
 
         With a lens pixels are (n,4), as `trace` takes them.
         """
+    def lengths(
+        self,
+        lengths: Sequence[tuple[int, str]],
+        *,
+        spp: float,
+        parametrisation: str,
+        threads: int = 0,
+    ) -> str:
+        """JSON, for each (k, emitter strategy): k, variance, rays, lit, mean, and the samples per pixel of `spp`."""
+    def draw(
+        self,
+        guide: Guide | None = None,
+        *,
+        uniform_fraction: float,
+        first_sample: int,
+        spp: int,
+        k: int,
+        parametrisation: str,
+        emitter_strategy: str,
+        seed: int = 0,
+        threads: int = 0,
+    ) -> dict[str, NDArray[Any]]:
+        """Draws `spp` paths a pixel as a pass does, rows, pixels and samples in order.
+
+        Returns what `trace` returns, and film (n,2) in pixels from the crop's corner, lens (n,2) or (0,2), m_nee (n,),
+        m_bsdf (n,); step_d (n,k,3) directions at x₁ … x_{k-1} and of the BSDF ray at x_k, step_weight (n,k,3)
+        f_s·|cos θ| ÷ pdf, step_pdf (n,k), 0 for delta lobes; join_d (n,3), join_scale (n,) w_nee ÷ p_nee, 0 where no
+        light was joined; mis (n,) w_bsdf, 0 where the ray met no light.
+        """
     def render(
         self,
         options: str,
@@ -144,7 +173,7 @@ class Scene:
 
         {"guide": "none" | "auto" | names of the registry joined by `+`, or an alias | "ready" (the fitted `guide`)
          | "foreign" (the object `guide`),
-         "guide_options": {...}, "k": 2, "parametrisation": "bsdf|cosine|uniform",
+         "guide_options": {...}, "k": 2 (0: emission), "parametrisation": "bsdf|cosine|uniform",
          "emitter_strategy": "mis|nee", "spp": N or null, "time": seconds or null,
          "snapshots": [shorter times], "replay": [passes of a record] or null,
          "uniform_fraction": a or null, "pilot_spp": n or null, "keep_pilot": true,

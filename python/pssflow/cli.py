@@ -33,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 RECORDED = (
     *("--guide", "--load-guide", "--preset", "--spp", "--time", "--pilot-spp", "--keep-pilot"),
-    *("--k", "--parametrisation", "--emitter-strategy", "--uniform-fraction", "--seed", "--set"),
+    *("--k", "--max-depth", "--parametrisation", "--emitter-strategy", "--uniform-fraction", "--seed", "--set"),
 )
 """What a record says itself, and cannot be given beside `--replay`."""
 
@@ -171,6 +171,11 @@ def _render_options(command: F) -> F:
     help="`auto` (whatever pays, or none), `none` (random numbers), a guide's name, or a saved one.  [default: auto]",
 )
 @_render_options
+@click.option(
+    "--max-depth",
+    type=int,
+    help="All light up to this depth, as Mitsuba counts it (1: emission, 2: and direct light), in place of --k.",
+)
 @click.option("--explain", is_flag=True, help="Print what `auto` considered, and why.")
 @click.option("--replay", metavar="RESULT.json", help="Repeat the recorded run, bit for bit.")
 @click.option("--save-guide", metavar="FILE", help="Save what was learned.")
@@ -201,6 +206,9 @@ def render(
     for other in RECORDED:
         _exclude(given, "--replay", other)
     _exclude(options, "--spp", "--time")
+    for other, value in (("--k", options["k"]), ("--load-guide", load_guide), ("--save-guide", save_guide)):
+        if options["max_depth"] is not None and value is not None:
+            raise click.UsageError(f"{other} is for light of one k, and was given beside --max-depth")
     target = _exr(output)
     record_target = target.with_suffix(".json")
     for path in (record_target, save_guide):
@@ -235,7 +243,9 @@ def render(
     else:
         terminal.out.print(_headline(scene, result.stats), highlight=False, soft_wrap=True)
         terminal.out.print(report.runs_table([result.stats]))
-        if explain:
+        if result.parts:
+            terminal.out.print(report.lengths_table(result.stats))
+        elif explain:
             terminal.out.print(report.candidates_table(result.stats))
         elif result.stats["candidates"]:
             terminal.out.print(report.choice_line(result.stats), highlight=False, soft_wrap=True)
@@ -485,6 +495,7 @@ def _arguments(options: Mapping[str, Any]) -> dict[str, Any]:
         for name in (
             "spp",
             "k",
+            "max_depth",
             "parametrisation",
             "uniform_fraction",
             "emitter_strategy",
@@ -496,7 +507,7 @@ def _arguments(options: Mapping[str, Any]) -> dict[str, Any]:
             "preset",
         )
     }
-    return {to: options[name] for to, name in names.items() if options[name] is not None}
+    return {to: options[name] for to, name in names.items() if options.get(name) is not None}
 
 
 def _settings(options: Mapping[str, Any], guides: Sequence[str]) -> dict[str, dict[str, Any]]:
@@ -536,9 +547,12 @@ def _one_run(path: str) -> Any:
 
 def _headline(scene: Any, stats: Mapping[str, Any]) -> str:
     """What all rows of a table share."""
-    bounces = "1 bounce" if stats["k"] == 1 else f"{stats['k']} bounces"
+    if stats["k"] is None:
+        what = f"all light to depth {stats['max_depth']}"
+    else:
+        what = "light of exactly " + ("1 bounce" if stats["k"] == 1 else f"{stats['k']} bounces")
     return (
-        f"{scene.name}: light of exactly {bounces}, {scene.width}×{scene.height}, "
+        f"{scene.name}: {what}, {scene.width}×{scene.height}, "
         f"{stats['parametrisation']}, {stats['emitter_strategy']}, seed {stats['seed']}"
     )
 

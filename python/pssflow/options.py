@@ -335,6 +335,16 @@ def read_replay(replay: str | os.PathLike[str] | Mapping[str, Any]) -> dict[str,
     if not isinstance(stats, Mapping):
         raise ValueError(f"{where}: holds a {type(stats).__name__}, not the record of a render")
     missing = [key for key in REPLAYED if key not in stats]
+    lengths = stats.get("lengths") or []
+    missing += [key for length in lengths for key in REPLAYED if key not in length]
     if missing:
         raise ValueError(f"{where}: lacks `{missing[0]}`; expected the record that `--json` prints")
-    return {key: stats[key] for key in REPLAYED}
+    told = {key: stats[key] for key in REPLAYED}
+    if lengths:
+        told["max_depth"] = check_integer("max_depth", stats.get("max_depth"), 1, MAX_BOUNCES + 1)
+        told["lengths"] = [
+            {key: length[key] for key in (*REPLAYED, "probe") if key in length}
+            | {"passes": check_passes(length["passes"])}
+            for length in lengths
+        ]
+    return told

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from . import _core, metrics
 from .guide import Choice, ForeignGuide, Guide, choose, usual_guide
+from .light import check_depth, render_light
 from .options import Plan, read_replay
 from .progress import Progress, reporting
 from .scene import Pilot, Scene, SceneLike, Trace
@@ -47,6 +48,11 @@ class Result:
     """Seconds: `load`, `export`, `bvh`, `pilot`, `fit`, `render`."""
     guide: Guide | ForeignGuide | None
     """The guide that drew the paths; None for random numbers."""
+    parts: tuple[Result, ...] = ()
+    """With `max_depth`, the light of each path length by itself: k = 0 (emission), 1 (direct light), 2, …"""
+    layers: dict[str, F32] = field(default_factory=dict)
+    """What `write` adds to image and variance, (H, W, 3) each: with `max_depth` the light of each length as `k0`, `k1`, …
+    and the share of paths that carry light as `nonzero_share`."""
     snapshots: tuple[Result, ...] = ()
     """What there was after each of the times `snapshots`, in the same form: each `stats` can be replayed."""
 
@@ -66,12 +72,12 @@ class Result:
         self.stats["relmse_trimmed"] = metrics.finite_or_none(metrics.relmse_trimmed(*args))
 
     def write(self, path: str | Path) -> None:
-        """Writes an EXR: the image as R, G, B and the variance as layer `variance`.
+        """Writes an EXR: the image as R, G, B, the variance as layer `variance`, and `layers`.
 
         Raises:
             OSError: it cannot be written; nothing is left behind.
         """
-        _core.write_exr(str(path), {"": self.image, "variance": self.variance})
+        _core.write_exr(str(path), {"": self.image, "variance": self.variance, **self.layers})
 
 
 def render(
@@ -79,7 +85,7 @@ def render(
     guide: str | os.PathLike[str] | Guide | ForeignGuide | None = None,
     spp: int | None = None,
     time: float | None = None,
-    k: int = 2,
+    k: int | None = None,
     parametrisation: str = "bsdf",
     uniform_fraction: float | None = None,
     seed: int = 0,
@@ -96,9 +102,12 @@ def render(
     combine: str | None = None,
     replay: Replay | None = None,
     snapshots: Sequence[float] = (),
+    max_depth: int | None = None,
     **guide_options: Any,
 ) -> Result:
     """Renders the light that reaches the eye after exactly k reflections: pilot → fit → render.
+
+    With `max_depth` it renders all light up to there instead: what Mitsuba's `path` shows at the same `max_depth`.
 
     Args:
         scene: a path to a scene's XML file, a dictionary as for `mi.load_dict`, an `mi.Scene` in its current state,
@@ -109,7 +118,7 @@ def render(
         spp: samples per pixel in all, pilot inside. Default: 16, or the preset's.
         time: seconds in place of `spp`, for pilot, fit and rendering together; loading and the BVH come before. The
             image then depends on the machine's speed; `replay` repeats it.
-        k: bounces, 1 … 32.
+        k: bounces, 1 … 32. Default: 2.
         parametrisation: what a direction's numbers mean: `bsdf`, `cosine` or `uniform` (hemisphere).
         uniform_fraction: share a of uniform paths in the mixture, in [0, 1]; no path's weight exceeds 1/a. Default:
             the guide's, 0.1 for tables and 0.25 for flows, or what `auto` finds best. At 0 the image may be biased.
@@ -134,6 +143,9 @@ def render(
         snapshots: shorter times, increasing, at which the image so far is handed out (`Result.snapshots`): the last one
             that was complete by then, or the first one there was. Passes are cut so that one ends shortly before;
             `stats["elapsed"]` tells the seconds really used. What handing out takes is not charged to `time`.
+        max_depth: longest path in place of `k`, as Mitsuba counts: 1 for emission alone, 2 with direct light, 3 with
+            light of two bounces, …, 33. Each length has its own guide and its own share of the budget: `spp` is what
+            each would get if all got the same. Fitted guides, presets and snapshots are for one k and are refused.
         **guide_options: the guide's own, as `epochs=7`; in a composite also `**{"realnvp.epochs": 7}`.
 
     Returns:
@@ -152,8 +164,10 @@ def render(
         ... )  # doctest: +SKIP
         >>> result.write("cornell-box.exr")  # doctest: +SKIP
     """
+    if max_depth is not None and k is not None:
+        raise ValueError(f"`k` = {k} and `max_depth` = {max_depth} were both given; give one")
     settings: dict[str, Any] = {
-        "k": k,
+        "k": 2 if k is None else k,
         "parametrisation": parametrisation,
         "emitter_strategy": emitter_strategy,
         "uniform_fraction": uniform_fraction,
@@ -161,11 +175,18 @@ def render(
         "combine": combine,
         "seed": seed,
     }
+    records: list[dict[str, Any]] | None = None
     if replay is not None:
         if time is not None or spp is not None:
             raise ValueError("`replay` repeats recorded passes; leave out `spp` and `time`")
         if isinstance(replay, (str, os.PathLike, Mapping)):
-            guide, guide_options, replay = _replayed(read_replay(replay), guide, settings)
+            replay = read_replay(replay)
+            if "lengths" in replay:
+                guide, guide_options, replay, max_depth, records = _replayed_light(replay, guide, settings)
+        elif max_depth is not None:
+            raise ValueError("`max_depth` was given, but `replay` holds the passes of one k")
+        if isinstance(replay, Mapping):
+            guide, guide_options, replay = _replayed(replay, guide, settings)
     choice = choose(usual_guide(preset) if guide is None else guide, guide_options)
     plan = Plan.make(
         learns=choice.learns,
@@ -190,6 +211,9 @@ def render(
         raise ValueError(
             f"`{name}` was given beside a `Scene`, which has its own; make another `Scene`"
         )
+    if max_depth is not None:
+        depth = check_depth(max_depth, choice, plan, preset)
+        return render_light(scene, choice, plan, depth, progress, records)
     return run(scene, choice, plan, progress)
 
 
@@ -198,7 +222,9 @@ def run(scene: Scene, choice: Choice, plan: Plan, progress: Progress = True) -> 
     strategy, why = scene.resolve_strategy(
         plan.emitter_strategy, plan.k, plan.parametrisation, plan.threads or None
     )
-    hashes = (scene.core.columns_hash(plan.k, plan.parametrisation), scene.hash)
+    # Emission (k = 0) has no columns, and no guide that could be saved.
+    columns = scene.core.columns_hash(plan.k, plan.parametrisation) if plan.k else ""
+    hashes = (columns, scene.hash)
     given = choice.given
     if choice.path is not None:
         given = Guide.load(choice.path, columns_hash=hashes[0], scene_hash=hashes[1])
@@ -251,3 +277,15 @@ def _replayed(
     if guide is None or isinstance(guide, (str, os.PathLike)):
         guide = record["guide"]
     return guide, dict(record["guide_options"]), list(record["passes"])
+
+
+def _replayed_light(
+    record: Mapping[str, Any], guide: Any, settings: dict[str, Any]
+) -> tuple[Any, dict[str, Any], None, int, list[dict[str, Any]]]:
+    """Guide, its options, depth and lengths of a record of a whole light; see `_replayed`."""
+    names = ("parametrisation", "emitter_strategy", "keep_pilot", "combine", "seed")
+    settings.update({name: record[name] for name in names})
+    if guide is None or isinstance(guide, (str, os.PathLike)):
+        guide = record["guide"]
+    lengths = [dict(length) for length in record["lengths"]]
+    return guide, dict(record["guide_options"]), None, record["max_depth"], lengths

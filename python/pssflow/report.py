@@ -21,6 +21,7 @@ __all__ = [
     "compare_picture",
     "count",
     "gain",
+    "lengths_table",
     "markdown_table",
     "number",
     "panel",
@@ -103,6 +104,28 @@ def candidates_table(run: Mapping[str, Any]) -> Table:
             number(candidate["net_gain"], 3),
             candidate["why"],
             style="bold" if candidate["chosen"] else None,
+        )
+    return shown
+
+
+def lengths_table(run: Mapping[str, Any]) -> Table:
+    """One row a path length of a whole light: what it got, what drew it, how much light it holds."""
+    shown = Table(title="path lengths")
+    shown.add_column("k", justify="right")
+    shown.add_column("guide")
+    for heading in ("spp", "s", "share of the light", "non-zero share", "rel. variance"):
+        shown.add_column(heading, justify="right")
+    whole = max(sum(run["mean"]), 1e-30)
+    for length in run["lengths"]:
+        seconds = sum(length["seconds"][name] for name in ("pilot", "fit", "render"))
+        shown.add_row(
+            str(length["k"]),
+            length["chosen"],
+            str(length["spp"]),
+            number(seconds, 3),
+            percent(sum(length["mean"]) / whole),
+            percent(length["nonzero_share"]),
+            number(length["variance"]),
         )
     return shown
 

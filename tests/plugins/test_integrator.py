@@ -117,7 +117,7 @@ def test_registering_twice_does_no_harm(scalar_variant):
     mi.set_variant("llvm_ad_rgb")
     mi.set_variant("scalar_rgb")
     assert load().integrator().result is None
-    assert list(PLUGINS) == ["pssflow", "pssflow_kbounce"]
+    assert list(PLUGINS) == ["pssflow", "pssflow_kbounce", "pss_guided", "pss_replay"]
 
 
 # --- whose arguments win ---------------------------------------------------------------------------------------------

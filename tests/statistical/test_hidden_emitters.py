@@ -12,7 +12,7 @@ import pytest
 from pssflow import Scene, render
 from tests.conftest import LLVM
 from tests.support.core import core_scene, our_runs
-from tests.support.runs import truth_runs
+from tests.support.runs import mitsuba_runs, truth_runs
 from tests.support.welch import ALPHA, welch
 
 pytestmark = [pytest.mark.stat, pytest.mark.timeout(600)]
@@ -104,3 +104,18 @@ def test_the_plugin_takes_it_as_mitsubas_integrators_do(llvm_variant: str) -> No
     ]
     assert not images[0][12:20, 12:20].any()
     assert images[1][12:20, 12:20].any()
+
+
+def test_all_light_hides_them_too(artifacts: Path) -> None:
+    """H0: up to a depth, too, lamps and sky are as in `path` with the same option. 16 seeds × 32 spp."""
+    mi.set_variant(LLVM)
+    scene = _scene(hide=True)
+    truth = mitsuba_runs(scene, max_depth=3, seeds=range(16), spp=64)
+    ours = Scene(scene)
+    runs = [
+        render(ours, "none", 32, seed=seed, max_depth=3, progress=False).image
+        for seed in range(1000, 1016)
+    ]
+    r = welch(truth, np.stack(runs))
+    assert r.p > ALPHA / 2, r.explain(artifacts)
+    assert [length["k"] for length in render(ours, "none", 1, max_depth=3, progress=False).stats["lengths"]] == [1, 2]

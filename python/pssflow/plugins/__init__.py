@@ -14,13 +14,15 @@ from typing import Any
 import mitsuba as mi
 
 from ..variants import VARIANTS
-from . import integrator, kbounce
+from . import guided, integrator, kbounce, replay
 
 __all__ = ["PLUGINS", "register"]
 
 PLUGINS: dict[str, tuple[str, Callable[[], Callable[[Any], Any]]]] = {
     "pssflow": ("register_integrator", integrator.define),
     "pssflow_kbounce": ("register_integrator", kbounce.define),
+    "pss_guided": ("register_integrator", guided.define),
+    "pss_replay": ("register_sampler", replay.define),
 }
 """Name in a scene → the registering function's name in `mitsuba`, and what makes a constructor for one variant."""
 

@@ -14,6 +14,15 @@ Learned light of exactly k bounces (:monosp:`pssflow`)
  * - k
    - |int|
    - Bounces between camera and light, 1 … 32. (Default: 2)
+ * - max_depth
+   - |int|
+   - In place of ``k``: all light up to this depth, counted as in ``path``: 1 is emission alone, 2 has direct light, 3
+     light of two bounces. Each length has a guide and a share of the budget of its own; ``spp`` is what each would get
+     if all got the same. -1 is refused. (Default: none)
+ * - aovs
+   - |bool|
+   - With ``max_depth``, whether the image has further channels: the light of each length (``k0.R`` …), the variance
+     and the share of paths that carry light. (Default: |false|)
  * - spp
    - |int|
    - Samples per pixel in all, pilot inside. (Default: the sampler's ``sample_count``; ``spp`` of ``mi.render`` wins)
@@ -61,15 +70,20 @@ Learned light of exactly k bounces (:monosp:`pssflow`)
    - An option of the guide, its name written with ``_``: ``realnvp_epochs``, ``realnvp_logit_hidden``. A dictionary's
      keys cannot hold the dot of the command's ``--set realnvp.epochs=7``. Options of another guide are refused.
 
-Renders only light that was reflected exactly k times on its way from an emitter: no emitter is seen, and for k = 2 no
-direct light. The image is unbiased for every guide as long as ``uniform_fraction`` is positive, since each sample is
+Without ``max_depth`` it renders only light that was reflected exactly k times on its way from an emitter: no emitter is
+seen, and for k = 2 no direct light. The image is unbiased for every guide as long as ``uniform_fraction`` is positive, since each sample is
 divided by the mixture's density; the preset ``thesis`` has none and may be biased. A guide costs a pilot and training
 in every call of ``render``: expect no gain at few samples, nor in easy scenes, and compare with ``guide`` = ``none``.
 
 Paths are traced by pssflow's core, not by Mitsuba, in ``scalar_rgb`` and ``llvm_ad_rgb``; other variants know no such
 plugin. The scene is read anew in each call, edits through ``mi.traverse`` included, and may hold only what ``pssflow
-info`` calls supported. Alpha is 1 everywhere. Nothing is differentiated: gradients raise an error. Attribute ``result``
-keeps the last ``pssflow.Result``: variance, statistics, the guide.
+info`` calls supported. Alpha is 1 everywhere. Attribute ``result`` keeps the last ``pssflow.Result``: variance,
+statistics, the guide.
+
+In ``llvm_ad_rgb`` it is differentiable: after ``mi.render(scene, params, …)`` come ``dr.backward`` or ``dr.forward``.
+The guides of that render draw paths with a seed of their own, ``spp_grad`` a pixel for each length, and Dr.Jit evaluates
+BSDFs, textures and emitters along them. Parameters that move geometry, or that belong to delta lobes, are refused by
+name, and so are hidden emitters and a sun beside a sky.
 
 .. tabs::
     .. code-tab:: xml
@@ -94,11 +108,14 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .. import gradients
 from .. import guide as guides
 from ..export.walk import is_scalar
+from ..light import check_depth, render_light
 from ..options import DEFAULT_SPP, Plan
 from ..render import Result, run
 from ..scene import Scene
@@ -142,11 +159,17 @@ def define() -> Callable[[Any], Any]:
             given = {name: props.get(name) for name in PARAMETERS if name in props}
             self.arguments: dict[str, Any] = given
             self.arguments["threads"] = props.get("threads", 0) or None
+            self.max_depth: int | None = props.get("max_depth") if "max_depth" in props else None
+            if self.max_depth is not None and "k" in given:
+                raise ValueError("`k` and `max_depth` were both given; give one")
+            self.aovs = bool(props.get("aovs", False)) and self.max_depth is not None
             self.progress = bool(props.get("progress", False))
             self.approximate = bool(props.get("approximate", False))
             self.result: Result | None = None
             # Wrong values are found where the scene is loaded, not when it is rendered.
-            self._plan(spp=0, seed=0, sample_count=DEFAULT_SPP)
+            plan = self._plan(spp=0, seed=0, sample_count=DEFAULT_SPP)
+            if self.max_depth is not None:
+                check_depth(self.max_depth, self.choice, plan, self.arguments.get("preset"))
 
         def render(
             self,
@@ -168,25 +191,65 @@ def define() -> Callable[[Any], Any]:
             ours = Scene(
                 scene, camera, hide_emitters=self.hide_emitters, approximate=self.approximate
             )
-            self.result = run(ours, self.choice, plan, self.progress)
-            _fill(camera.film(), self.result.image)
+            if self.max_depth is None:
+                self.result = run(ours, self.choice, plan, self.progress)
+            else:
+                self.result = render_light(ours, self.choice, plan, self.max_depth, self.progress)
+            _fill(camera.film(), self.result, self.aov_names())
             return camera.film().develop() if develop else mi.TensorXf()
 
-        def render_forward(self, *_args: Any, **_kwargs: Any) -> Any:
-            """Raises: there are no derivatives."""
-            raise NotImplementedError(NO_GRADIENTS)
+        def render_forward(
+            self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0
+        ) -> Any:
+            """The image's derivative along the parameters' gradients; see `pssflow.gradients`."""
+            camera, drawn = self._to_differentiate(scene, params, sensor, spp)
+            with dr.suspend_grad():
+                return gradients.forward(*drawn[:2], camera, _scalar(seed), *drawn[2:])
 
-        def render_backward(self, *_args: Any, **_kwargs: Any) -> None:
-            """Raises: there are no derivatives."""
-            raise NotImplementedError(NO_GRADIENTS)
+        def render_backward(
+            self,
+            scene: Any,
+            params: Any,
+            grad_in: Any,
+            sensor: Any = 0,
+            seed: Any = 0,
+            spp: int = 0,
+        ) -> None:
+            """Adds the gradients of the parameters to what they have; see `pssflow.gradients`."""
+            camera, drawn = self._to_differentiate(scene, params, sensor, spp)
+            with dr.suspend_grad():
+                gradients.backward(*drawn[:2], camera, grad_in, _scalar(seed), *drawn[2:])
+
+        def _to_differentiate(
+            self, scene: Any, params: Any, sensor: Any, spp: int
+        ) -> tuple[Any, tuple[Scene, Result, int, str]]:
+            """The camera, and what is drawn from: scene, render, samples per pixel, parametrisation."""
+            if is_scalar():
+                raise NotImplementedError(NO_GRADIENTS)
+            gradients.check_parameters(scene, params)
+            camera = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            if self.aovs:
+                raise ValueError("gradients are not supported with `aovs`")
+            ours = Scene(
+                scene, camera, hide_emitters=self.hide_emitters, approximate=self.approximate
+            )
+            if self.result is None:
+                self.render(scene, camera, spp=spp)
+            assert self.result is not None
+            samples = int(spp) or self.arguments.get("spp") or camera.sampler().sample_count()
+            return camera, (ours, self.result, samples, self.result.stats["parametrisation"])
 
         def aov_names(self) -> list[str]:
-            """None: the variance is in `result`."""
-            return []
+            """With `max_depth` and `aovs` a name for each channel of `result`'s layers; else none."""
+            if not self.aovs or self.max_depth is None:
+                return []
+            layers = [f"k{k}" for k in range(self.max_depth)]
+            return [f"{layer}.{c}" for layer in (*layers, *OTHER_LAYERS) for c in "RGB"]
 
         def to_string(self) -> str:
             """As Mitsuba prints its own."""
-            values = {"guide": self.choice.label, **self.arguments, **self.choice.options}
+            values = {"guide": self.choice.label, "max_depth": self.max_depth}
+            values |= {**self.arguments, **self.choice.options}
             lines = [f"  {name} = {value}" for name, value in values.items() if value is not None]
             return "PssflowIntegrator[\n" + ",\n".join(lines) + "\n]"
 
@@ -206,7 +269,7 @@ def define() -> Callable[[Any], Any]:
     return PssflowIntegrator
 
 
-NO_GRADIENTS = "integrator pssflow: it has no derivatives; differentiate with Mitsuba's `prb`"
+NO_GRADIENTS = "integrator pssflow: scalar variants have no derivatives; use llvm_ad_rgb"
 
 
 def _guide_options(props: Any, guide: str) -> dict[str, Any]:
@@ -221,12 +284,22 @@ def _guide_options(props: Any, guide: str) -> dict[str, Any]:
     return options
 
 
-def _fill(film: Any, image: Any) -> None:
-    """Makes an image (H, W, 3) the film's content, so that it develops to its own pixel format."""
-    channels = film.prepare([])
-    # R G B W, or R G B A W; the image is filtered and divided by its weights already.
-    values = np.ones((*image.shape[:2], channels), np.float32)
-    values[..., :3] = image
+OTHER_LAYERS = ("variance", "nonzero_share")
+"""Channels beside those of the path lengths."""
+
+
+def _fill(film: Any, result: Result, aovs: list[str]) -> None:
+    """Makes an image (H, W, 3) and its layers the film's content, so that it develops to its own pixel format."""
+    channels = film.prepare(aovs)
+    # R G B W, or R G B A W, then others; the image is filtered and divided by its weights already.
+    values = np.ones((*result.image.shape[:2], channels), np.float32)
+    values[..., :3] = result.image
+    layers = {"variance": result.variance, **result.layers}
+    for i, name in enumerate(aovs):
+        layer, _, channel = name.rpartition(".")
+        values[..., channels - len(aovs) + i] = (
+            layers[layer][..., "RGB".index(channel)] if layer in layers else 0.0
+        )
     tensor: Any = mi.TensorXf(values)
     film.put_block(mi.ImageBlock(tensor, film.crop_offset(), border=False))
 

@@ -4,6 +4,7 @@
 
 mod arrays;
 mod contexts;
+mod drawn;
 mod errors;
 mod foreign;
 mod guide;

@@ -7,7 +7,7 @@ use std::sync::{Arc, OnceLock};
 use numpy::PyReadonlyArray2;
 use pss_render::math::Rgb;
 use pss_render::{Columns, EmitterStrategy, Parametrisation, Paths, Tracer};
-use pssflow::{Auto, Budget, Combine, GuideChoice, Named, Options, PassPlan};
+use pssflow::{Auto, Budget, Combine, GuideChoice, Mixture, Named, Options, PassPlan};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use serde::Deserialize;
@@ -16,7 +16,7 @@ use serde_json::{Map, Value, json};
 use crate::foreign::{ForeignGuide, Guarded};
 use crate::guide::Guide;
 use crate::watch::watched;
-use crate::{arrays, errors, outcome};
+use crate::{arrays, drawn, errors, outcome};
 
 /// A scene that can be traced.
 #[pyclass(module = "pssflow._core", frozen)]
@@ -245,12 +245,13 @@ impl Scene {
     ) -> PyResult<Bound<'py, PyDict>> {
         let request: Request = serde_json::from_str(options)
             .map_err(|e| errors::value(format!("render options: {e}")))?;
-        let tracer = self.tracer(
-            request.k,
-            &request.parametrisation,
-            &request.emitter_strategy,
-        )?;
-        let dims = tracer.columns().learned();
+        let dims = match request.k {
+            0 => 0,
+            k => {
+                let tracer = self.tracer(k, &request.parametrisation, &request.emitter_strategy)?;
+                tracer.columns().learned()
+            }
+        };
         let mut foreign = None;
         let choice = self.choice(&request, dims, guide.as_ref(), &mut foreign)?;
         let options = self.options(&request, choice)?;
@@ -268,6 +269,80 @@ impl Scene {
         let outcome = outcome.map_err(errors::render)?;
         let object = foreign.and(guide);
         outcome::to_dict(py, outcome, &options, object.as_ref())
+    }
+
+    /// What a probe sees of path lengths, each (k, strategy), and the samples per pixel that each gets of `spp`, JSON.
+    #[pyo3(signature = (lengths, *, spp, parametrisation, threads=0))]
+    fn lengths(
+        &self,
+        py: Python<'_>,
+        lengths: Vec<(usize, String)>,
+        spp: f64,
+        parametrisation: &str,
+        threads: usize,
+    ) -> PyResult<String> {
+        let parametrisation = self::parametrisation(parametrisation)?;
+        let lengths = lengths
+            .into_iter()
+            .map(|(k, name)| Ok((k, strategy(&name)?)))
+            .collect::<PyResult<Vec<_>>>()?;
+        let probed = py
+            .detach(|| pssflow::probe_lengths(&self.inner, &lengths, parametrisation, threads))
+            .map_err(errors::render)?;
+        let shares = pssflow::allot(&probed, spp);
+        let with_share = |(length, spp): (&pssflow::Length, f64)| {
+            let mut value = json!(length);
+            value["spp"] = json!(spp);
+            value
+        };
+        let values: Vec<Value> = probed.iter().zip(shares).map(with_share).collect();
+        Ok(Value::from(values).to_string())
+    }
+
+    /// Draws paths as a pass does and returns what each decision came to, in the order of pixels.
+    #[pyo3(signature = (
+        guide=None, *, uniform_fraction, first_sample, spp, k, parametrisation, emitter_strategy, seed=0, threads=0
+    ))]
+    #[allow(clippy::too_many_arguments)]
+    fn draw<'py>(
+        &self,
+        py: Python<'py>,
+        guide: Option<PyRef<'py, Guide>>,
+        uniform_fraction: f32,
+        first_sample: u32,
+        spp: u32,
+        k: usize,
+        parametrisation: &str,
+        emitter_strategy: &str,
+        seed: u64,
+        threads: usize,
+    ) -> PyResult<Bound<'py, PyDict>> {
+        let tracer = self.tracer(k, parametrisation, emitter_strategy)?;
+        self.check_at_once(spp)?;
+        if !(uniform_fraction > 0.0 && uniform_fraction <= 1.0) {
+            return Err(errors::value(format!(
+                "uniform_fraction = {uniform_fraction}: must be in (0, 1]"
+            )));
+        }
+        let guide = guide.map(|g| Arc::clone(&g.inner));
+        if let Some(guide) = &guide {
+            let expected = tracer.columns().learned();
+            if guide.dims() != expected {
+                return Err(errors::value(format!(
+                    "guide {:?} models {} columns, but k = {k} bounces have {expected}",
+                    guide.name(),
+                    guide.dims()
+                )));
+            }
+        }
+        let mixture = Mixture { uniform_fraction };
+        let blocks = py
+            .detach(|| {
+                let guide = guide.as_deref().map(|g| (g, mixture));
+                pssflow::drawn_blocks(&tracer, guide, seed, (first_sample, spp), threads)
+            })
+            .map_err(errors::render)?;
+        drawn::to_dict(py, &blocks, mixture, k)
     }
 
     /// Times the Embree queries of a render alone.
@@ -403,7 +478,11 @@ fn film_and_lens(pixels: &PyReadonlyArray2<'_, f32>) -> PyResult<(Vec<[f32; 2]>,
 }
 
 /// Blocks of traced paths as one dictionary of arrays.
-fn traced<'py>(py: Python<'py>, blocks: &[Paths], k: usize) -> PyResult<Bound<'py, PyDict>> {
+pub(crate) fn traced<'py>(
+    py: Python<'py>,
+    blocks: &[Paths],
+    k: usize,
+) -> PyResult<Bound<'py, PyDict>> {
     let all = |get: &dyn Fn(&Paths) -> &Vec<Rgb>| -> Vec<Rgb> {
         blocks.iter().flat_map(|b| get(b).iter().copied()).collect()
     };

@@ -52,7 +52,7 @@ pub struct Columns {
 }
 
 impl Columns {
-    /// The table for `k ≥ 1` bounces.
+    /// The table for `k` bounces. With none there is nothing to decide: emitters that the camera sees.
     pub fn new(k: usize, strategy: EmitterStrategy) -> Self {
         Self { k, strategy }
     }
@@ -67,16 +67,16 @@ impl Columns {
         self.strategy
     }
 
-    /// Columns that a guide of the whole path learns: 2k + 1. The two of the BSDF ray, where there is one, are a decision
-    /// of their own.
+    /// Columns that a guide of the whole path learns: 2k + 1, or none where nothing is reflected. The two of the BSDF ray,
+    /// where there is one, are a decision of their own.
     pub fn learned(&self) -> usize {
-        2 * self.k + 1
+        if self.k == 0 { 0 } else { 2 * self.k + 1 }
     }
 
     /// All columns: 2k + 1, and two more with `mis`.
     pub fn width(&self) -> usize {
         self.learned()
-            + if self.strategy == EmitterStrategy::Mis {
+            + if self.k > 0 && self.strategy == EmitterStrategy::Mis {
                 2
             } else {
                 0
@@ -98,6 +98,9 @@ impl Columns {
     /// One name a column, in order.
     pub fn names(&self) -> Vec<String> {
         let mut names = Vec::with_capacity(self.width());
+        if self.k == 0 {
+            return names;
+        }
         for b in 1..self.k {
             names.push(format!("x{b}.direction.0"));
             names.push(format!("x{b}.direction.1"));
@@ -151,6 +154,13 @@ mod tests {
                 assert_eq!(columns.names().len(), columns.width());
             }
         }
+    }
+
+    #[test]
+    fn without_bounces_nothing_is_decided() {
+        let columns = Columns::new(0, EmitterStrategy::Mis);
+        assert_eq!((columns.learned(), columns.width()), (0, 0));
+        assert!(columns.names().is_empty());
     }
 
     #[test]

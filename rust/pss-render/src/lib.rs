@@ -12,6 +12,7 @@ pub mod bsdf;
 pub mod columns;
 mod description;
 mod distribution;
+mod emission;
 pub mod emitter;
 mod error;
 pub mod film;
@@ -25,6 +26,7 @@ pub mod paths;
 mod scene;
 mod sensor;
 pub mod shape;
+pub mod steps;
 pub mod texture;
 mod warp;
 

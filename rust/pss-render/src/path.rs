@@ -26,6 +26,7 @@ use crate::numbers::{Lanes, NumberSource, VertexContext};
 use crate::packet::Packet;
 use crate::paths::{Paths, State};
 use crate::scene::{BsdfTraits, Scene};
+use crate::steps::{Join, Step};
 use crate::warp::{
     UNIFORM_HEMISPHERE_PDF, cosine_hemisphere_pdf, square_to_cosine_hemisphere,
     square_to_uniform_hemisphere,
@@ -98,6 +99,15 @@ impl<'a> Tracer<'a> {
         })
     }
 
+    /// A tracer of what the camera sees shine: light that no surface reflects. It asks for no number.
+    pub fn emission(scene: &'a Scene) -> Self {
+        Self {
+            scene,
+            columns: Columns::new(0, EmitterStrategy::Nee),
+            parametrisation: Parametrisation::default(),
+        }
+    }
+
     /// The table of columns.
     pub fn columns(&self) -> Columns {
         self.columns
@@ -117,6 +127,12 @@ impl<'a> Tracer<'a> {
     pub fn trace(&self, paths: &mut Paths, numbers: &mut dyn NumberSource) {
         let k = self.columns.k();
         paths.reset();
+        if k == 0 {
+            self.camera_rays(paths);
+            self.seen_emission(paths);
+            Self::drop_non_finite(paths);
+            return;
+        }
 
         // ---------------- Numbers that are decided before the path is known ----------------
         self.ask(paths, numbers, Decision::Path);
@@ -200,7 +216,7 @@ impl<'a> Tracer<'a> {
         });
     }
 
-    fn camera_rays(&self, paths: &mut Paths) {
+    pub(crate) fn camera_rays(&self, paths: &mut Paths) {
         let sensor = self.scene.sensor();
         let (film, lens) = (&paths.film, &paths.lens);
         paths.states.clear();
@@ -277,10 +293,14 @@ impl<'a> Tracer<'a> {
                 continue;
             };
             state.throughput *= sample.weight;
-            if state.throughput.max_element() <= 0.0 {
+            let wo = state.frame.to_world(sample.wo);
+            if let Some(steps) = &mut paths.steps {
+                steps.scattered[lane as usize * self.columns.k() + b - 1] = Step::new(wo, &sample);
+            }
+            // A path that reflects nothing has a derivative all the same.
+            if state.throughput.max_element() <= 0.0 && paths.steps.is_none() {
                 continue;
             }
-            let wo = state.frame.to_world(sample.wo);
             state.ray = state.si.spawn_ray(wo);
             paths.active[kept] = lane;
             kept += 1;
@@ -373,9 +393,13 @@ impl<'a> Tracer<'a> {
                 1.0
             };
             let f = state.throughput * bsdf_value * light.radiance * (weight / p_nee);
-            if f == Rgb::ZERO {
+            if f == Rgb::ZERO && paths.steps.is_none() {
                 continue;
             }
+            let join = Join {
+                d: light.d.to_array(),
+                scale: weight / p_nee,
+            };
             let ray = match light.target {
                 Some(p) => state.si.spawn_ray_to(p),
                 None => state.si.spawn_ray(light.d),
@@ -383,11 +407,11 @@ impl<'a> Tracer<'a> {
             if let Some(log) = &mut paths.rays {
                 log.shadow.push(ray);
             }
-            if packet.push(ray, (lane, f)) {
-                packet.unoccluded(accel, |(lane, f)| paths.f_nee[lane] = f);
+            if packet.push(ray, (lane, f, join)) {
+                packet.unoccluded(accel, |joined| paths.join(joined));
             }
         }
-        packet.unoccluded(accel, |(lane, f)| paths.f_nee[lane] = f);
+        packet.unoccluded(accel, |joined| paths.join(joined));
     }
 
     /// The second term of f: a BSDF-sampled ray from x_k that meets an emitter.
@@ -405,12 +429,16 @@ impl<'a> Tracer<'a> {
                 continue;
             };
             let throughput = state.throughput * sample.weight;
-            if throughput.max_element() <= 0.0 {
+            if throughput.max_element() <= 0.0 && paths.steps.is_none() {
                 continue;
             }
-            let ray = state.si.spawn_ray(state.frame.to_world(sample.wo));
+            let wo = state.frame.to_world(sample.wo);
+            let ray = state.si.spawn_ray(wo);
             if let Some(log) = &mut paths.rays {
                 log.next.push(ray);
+            }
+            if let Some(steps) = &mut paths.steps {
+                steps.scattered[(lane + 1) * self.columns.k() - 1] = Step::new(wo, &sample);
             }
             let scattered = Scattered {
                 lane,
@@ -420,34 +448,34 @@ impl<'a> Tracer<'a> {
             };
             if packet.push(ray, scattered) {
                 packet.intersect(accel, false, |s, ray, hit| {
-                    paths.f_bsdf[s.lane] = self.arriving(&s, ray, hit.as_ref());
+                    paths.arrive(s.lane, self.arriving(&s, ray, hit.as_ref()));
                 });
             }
         }
         packet.intersect(accel, false, |s, ray, hit| {
-            paths.f_bsdf[s.lane] = self.arriving(&s, ray, hit.as_ref());
+            paths.arrive(s.lane, self.arriving(&s, ray, hit.as_ref()));
         });
     }
 
-    /// What a BSDF-sampled ray brings back from the emitter that it meets, weighted.
-    fn arriving(&self, from: &Scattered, ray: &Ray, hit: Option<&Hit>) -> Rgb {
+    /// What a BSDF-sampled ray brings back from the emitter that it meets, weighted, and the weight.
+    fn arriving(&self, from: &Scattered, ray: &Ray, hit: Option<&Hit>) -> (Rgb, f32) {
         let d = Vec3::from_array(ray.dir);
         let brought = |e: usize, surface: Option<&Interaction>| {
             let emitter = self.scene.emitters()[e].model();
             let radiance = emitter.eval(self.scene, d, surface);
             if radiance == Rgb::ZERO {
-                return Rgb::ZERO;
+                return (Rgb::ZERO, 0.0);
             }
             let weight = from.pdf.map_or(1.0, |pdf| {
                 let p_nee = self.scene.emitter_choice().probability(e)
                     * emitter.pdf_direction(self.scene, from.from, d, surface);
                 pdf / (pdf + p_nee)
             });
-            from.throughput * radiance * weight
+            (from.throughput * radiance * weight, weight)
         };
         match hit {
             // Most surfaces shine not at all: their shading is nobody's business then.
-            Some(hit) => self.scene.emitter_at(hit).map_or(Rgb::ZERO, |e| {
+            Some(hit) => self.scene.emitter_at(hit).map_or((Rgb::ZERO, 0.0), |e| {
                 brought(e, Some(&self.scene.interaction(ray, hit)))
             }),
             None => self
@@ -455,7 +483,7 @@ impl<'a> Tracer<'a> {
                 .environments()
                 .iter()
                 .map(|&e| brought(e, None))
-                .sum(),
+                .fold((Rgb::ZERO, 0.0), |(f, _), (g, weight)| (f + g, weight)),
         }
     }
 

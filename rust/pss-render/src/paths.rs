@@ -7,6 +7,7 @@ use crate::error::TraceError;
 use crate::interaction::Interaction;
 use crate::math::{Frame, Rgb, Vec3};
 use crate::numbers::VertexContext;
+use crate::steps::{Join, Steps};
 
 /// A block of paths: what goes in, and what comes out. Structure of arrays, reused block after block.
 #[derive(Debug)]
@@ -36,6 +37,8 @@ pub struct Paths {
     pub record: bool,
     /// In and out: where to note every ray, for measuring them alone; `None` costs nothing.
     pub rays: Option<RayLog>,
+    /// In and out: where to note what was decided; `None` costs nothing.
+    pub steps: Option<Steps>,
     /// Out: paths whose f was not finite and was set to zero.
     pub non_finite: u64,
     pub(crate) active: Vec<u32>,
@@ -124,6 +127,7 @@ impl Paths {
             contexts: Vec::new(),
             record: false,
             rays: None,
+            steps: None,
             non_finite: 0,
             active: Vec::new(),
             states: Vec::new(),
@@ -220,7 +224,26 @@ impl Paths {
             self.contexts
                 .resize(n * self.columns.k(), VertexContext::default());
         }
+        if let Some(steps) = &mut self.steps {
+            steps.reset(n, self.columns.k());
+        }
         self.non_finite = 0;
+    }
+
+    /// A light was joined: no surface is in between.
+    pub(crate) fn join(&mut self, (lane, f, join): (usize, Rgb, Join)) {
+        self.f_nee[lane] = f;
+        if let Some(steps) = &mut self.steps {
+            steps.joins[lane] = join;
+        }
+    }
+
+    /// A BSDF-sampled ray has met what it met.
+    pub(crate) fn arrive(&mut self, lane: usize, (f, weight): (Rgb, f32)) {
+        self.f_bsdf[lane] = f;
+        if let Some(steps) = &mut self.steps {
+            steps.mis[lane] = weight;
+        }
     }
 
     /// The numbers of a two-number decision.

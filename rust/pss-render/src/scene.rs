@@ -253,6 +253,11 @@ impl Scene {
         })
     }
 
+    /// Whether the camera sees no emitter.
+    pub(crate) fn hides_emitters(&self) -> bool {
+        self.hide_emitters
+    }
+
     /// Hash of description and arrays (hex).
     pub fn hash(&self) -> &str {
         &self.hash

@@ -100,7 +100,7 @@ impl Outcome {
     }
 }
 
-/// Renders the k-bounce indirect light of `scene`.
+/// Renders the k-bounce light of `scene`; at k = 0 the emitters that the camera sees.
 ///
 /// With [`Budget::Spp`] or [`Budget::Replay`], one seed gives one image, bit for bit, for any number of
 /// threads. With [`Budget::Time`] the passes depend on the machine; [`Outcome::passes`] replays them.
@@ -113,7 +113,10 @@ pub fn render(
     progress: &dyn Progress,
 ) -> Result<Outcome, RenderError> {
     options.check()?;
-    let tracer = Tracer::new(scene, options.k, options.parametrisation, options.strategy)?;
+    let tracer = match options.k {
+        0 => Tracer::emission(scene),
+        k => Tracer::new(scene, k, options.parametrisation, options.strategy)?,
+    };
     let pool = thread_pool(options.threads)?;
     let context = PassContext {
         tracer,

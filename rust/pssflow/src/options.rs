@@ -98,7 +98,7 @@ fn all() -> f32 {
 pub struct Options {
     /// Where the numbers come from.
     pub guide: GuideChoice,
-    /// Bounces, 1 … 32.
+    /// Bounces, 1 … 32; 0 for emitters that the camera sees, where there is nothing to guide.
     pub k: usize,
     /// What a direction's numbers mean.
     pub parametrisation: Parametrisation,
@@ -154,6 +154,9 @@ impl Options {
         let error = |name, value: String, rule| Err(RenderError::Option { name, value, rule });
         if let Some(a) = self.uniform_fraction.filter(|a| !(0.0..=1.0).contains(a)) {
             return error("uniform_fraction", a.to_string(), "in [0, 1]");
+        }
+        if self.k == 0 && !matches!(self.guide, GuideChoice::None) {
+            return error("k", "0".to_owned(), "1 or more with a guide");
         }
         match &self.budget {
             Budget::Spp(spp) if !(1..=Self::MOST_SPP).contains(spp) => {

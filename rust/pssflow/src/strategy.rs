@@ -11,6 +11,7 @@
 //! variance has a heavy tail where a surface is near a lamp: an answer that hangs on one sample is not trusted.
 
 use pss_render::math::luminance;
+use pss_render::paths::RayLog;
 use pss_render::{EmitterStrategy, Parametrisation, Paths, Scene, Tracer, Uniform};
 use pss_rng::{Purpose, Stream};
 use rayon::prelude::*;
@@ -22,7 +23,7 @@ use crate::pass::path_numbers;
 /// Most pixels along an edge of the probe's grid.
 const GRID: u32 = 64;
 /// Paths through each pixel of it.
-const SAMPLES: u32 = 16;
+pub(crate) const SAMPLES: u32 = 16;
 /// Of the random numbers: another one than renders use by default, so that no image repeats the probe's paths.
 const SEED: u64 = 0x5eed_a070;
 /// Share of the cost that `nee` must save.
@@ -99,6 +100,36 @@ pub fn auto_strategy(
     })
 }
 
+/// Luminances of the probe's paths, [`SAMPLES`] next to each other for each pixel of the grid, and how many rays they took.
+pub(crate) fn probe_paths(tracer: &Tracer<'_>) -> (Vec<f64>, u64) {
+    let scene = tracer.scene();
+    let [width, height] = scene.film().crop_size();
+    let places = |n: u32| (0..n).step_by(n.div_ceil(GRID).max(1) as usize);
+    let rows: Vec<u32> = places(height).collect();
+    // Row by row, merged in their order.
+    let done: Vec<(Vec<f64>, u64)> = rows
+        .par_iter()
+        .map(|&y| {
+            let columns = tracer.columns();
+            let stream = Stream::new(SEED, Purpose::Path);
+            let mut paths = Paths::new(columns);
+            paths.rays = Some(RayLog::default());
+            for x in places(width) {
+                for sample in 0..SAMPLES {
+                    let pixel = [x, y];
+                    path_numbers(&stream, scene, pixel, sample, columns.width(), &mut paths);
+                }
+            }
+            tracer.trace(&mut paths, &mut Uniform);
+            let seen = (0..paths.len()).map(|j| f64::from(luminance(paths.f(j))));
+            let rays = paths.rays.as_ref().map_or(0, RayLog::len);
+            (seen.collect(), rays as u64)
+        })
+        .collect();
+    let rays = done.iter().map(|(_, rays)| rays).sum();
+    (done.into_iter().flat_map(|(seen, _)| seen).collect(), rays)
+}
+
 /// What the probe saw.
 struct Probe {
     /// V of `mis` and of `nee`.
@@ -109,39 +140,7 @@ struct Probe {
 
 impl Probe {
     fn new(tracers: &[Tracer<'_>; 2]) -> Self {
-        let scene = tracers[0].scene();
-        let [width, height] = scene.film().crop_size();
-        let places = |n: u32| (0..n).step_by(n.div_ceil(GRID).max(1) as usize);
-        let rows: Vec<u32> = places(height).collect();
-        // Row by row, merged in their order.
-        let samples: Vec<[Vec<f64>; 2]> = rows
-            .par_iter()
-            .map(|&y| {
-                [0, 1].map(|i| {
-                    let columns = tracers[i].columns();
-                    let stream = Stream::new(SEED, Purpose::Path);
-                    let mut paths = Paths::new(columns);
-                    for x in places(width) {
-                        for sample in 0..SAMPLES {
-                            path_numbers(
-                                &stream,
-                                scene,
-                                [x, y],
-                                sample,
-                                columns.width(),
-                                &mut paths,
-                            );
-                        }
-                    }
-                    tracers[i].trace(&mut paths, &mut Uniform);
-                    (0..paths.len())
-                        .map(|j| f64::from(luminance(paths.f(j))))
-                        .collect()
-                })
-            })
-            .collect();
-        let [mis, nee] =
-            [0, 1].map(|i| -> Vec<f64> { samples.iter().flat_map(|s| &s[i]).copied().collect() });
+        let [mis, nee] = [0, 1].map(|i| probe_paths(&tracers[i]).0);
         let n = SAMPLES as usize;
         let total: f64 = mis.iter().chain(&nee).sum();
         let epsilon = (0.1 * total / (mis.len() + nee.len()).max(1) as f64).powi(2);

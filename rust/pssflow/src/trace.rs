@@ -2,12 +2,16 @@
 
 use std::time::Instant;
 
+use pss_guide::Guide;
+use pss_render::steps::Steps;
 use pss_render::{Paths, Tracer, Uniform};
 use pss_rng::{Purpose, Stream};
 use rayon::prelude::*;
 
 use crate::error::RenderError;
 use crate::estimator::thread_pool;
+use crate::mixture::Mixture;
+use crate::numbers::GuidedNumbers;
 use crate::pass::{BLOCK, path_numbers};
 
 /// Uniform paths of `spp` samples a pixel, rows and pixels in order, not yet traced. The numbers are those
@@ -58,6 +62,49 @@ pub fn trace_blocks(
             .collect()
     });
     Ok(blocks)
+}
+
+/// Draws `spp` samples a pixel as a render's pass does, from the mixture or uniformly, and keeps what every decision came
+/// to; rows, pixels and samples in order, in blocks. Their m is the mixture's density of `q_nee` and `q_bsdf`.
+///
+/// # Errors
+/// [`RenderError::Threads`].
+pub fn drawn_blocks(
+    tracer: &Tracer<'_>,
+    guide: Option<(&dyn Guide, Mixture)>,
+    seed: u64,
+    (first_sample, spp): (u32, u32),
+    threads: usize,
+) -> Result<Vec<Paths>, RenderError> {
+    let scene = tracer.scene();
+    let width = scene.film().crop_size()[0];
+    let columns = tracer.columns();
+    let stream = Stream::new(seed, Purpose::Path);
+    let total = scene.film().pixels() * spp as usize;
+    let pool = thread_pool(threads)?;
+    let starts: Vec<usize> = (0..total).step_by(BLOCK).collect();
+    let block = |&start: &usize| {
+        let mut paths = Paths::new(columns);
+        paths.record = true;
+        paths.steps = Some(Steps::default());
+        let mut coins = Vec::with_capacity(BLOCK);
+        for i in start..total.min(start + BLOCK) {
+            let (pixel, sample) = (i / spp as usize, first_sample + (i % spp as usize) as u32);
+            let at = [pixel as u32 % width, pixel as u32 / width];
+            let [coin, _] = path_numbers(&stream, scene, at, sample, columns.width(), &mut paths);
+            coins.push(coin);
+        }
+        match guide {
+            Some((guide, mixture)) => {
+                let mut numbers = GuidedNumbers::new(guide);
+                numbers.toss(coins.into_iter(), mixture);
+                tracer.trace(&mut paths, &mut numbers);
+            }
+            None => tracer.trace(&mut paths, &mut Uniform),
+        }
+        paths
+    };
+    Ok(pool.install(|| starts.par_iter().map(block).collect()))
 }
 
 /// The time of a set of rays.

@@ -1,0 +1,296 @@
+"""The whole light up to a depth: emission, direct light and k = 2, 3, … bounces, rendered apart and added.
+
+Each length has a guide of its own and its own samples: of a budget it gets what a probe of uniform paths says lowers
+the error most (`rust/pssflow/src/lengths.rs`). The shares are fixed before sampling and no path of the probe is in the
+image, so the sum is as unbiased as its parts. Each part is a render that can be replayed; so can the sum.
+"""
+
+from __future__ import annotations
+
+import json
+import time as clock
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from . import _core, metrics
+from .guide import LUMINANCE, Choice, choose
+from .options import MAX_BOUNCES, Plan, check_integer
+from .progress import Listener, Progress, reporting
+
+if TYPE_CHECKING:
+    from .render import Result
+    from .scene import Scene
+
+__all__ = ["check_depth", "render_light", "share_layer"]
+
+ODD = 0x9E3779B97F4A7C15
+"""Distance of the seeds of two lengths: their paths must not repeat each other's numbers, or errors would add up."""
+
+
+def check_depth(max_depth: Any, choice: Choice, plan: Plan, preset: str | None) -> int:
+    """`max_depth` as it is, if it can be rendered with these arguments.
+
+    Raises:
+        ValueError: one line.
+    """
+    if max_depth == -1:
+        raise ValueError(
+            "`max_depth` = -1: paths of any length are not supported; "
+            f"give the longest one, at most {MAX_BOUNCES + 1}"
+        )
+    depth = check_integer("max_depth", max_depth, 1, MAX_BOUNCES + 1)
+    if preset is not None:
+        raise ValueError(f"`preset` = {preset!r} renders light of one k; leave out `max_depth`")
+    if plan.snapshots:
+        raise ValueError("`snapshots` are not supported with `max_depth`")
+    if choice.kind == "ready":
+        raise ValueError(
+            "a fitted guide is for paths of one length; leave out `max_depth`, or give the guide's name"
+        )
+    return depth
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A length to render."""
+
+    k: int
+    strategy: str
+    probe: Mapping[str, Any]
+    """What the core says of it; its `spp` is a fraction."""
+
+    @property
+    def cost(self) -> float:
+        """Rays a pixel."""
+        return self.probe["spp"] * self.probe["rays"]
+
+
+def render_light(
+    scene: Scene,
+    choice: Choice,
+    plan: Plan,
+    max_depth: int,
+    progress: Progress = True,
+    records: Sequence[Mapping[str, Any]] | None = None,
+) -> Result:
+    """Renders light of up to `max_depth` − 1 bounces with arguments that were checked already; see `render`.
+
+    Args:
+        scene: the scene.
+        choice: the guide of each length but emission.
+        plan: the budget, and what all lengths share.
+        max_depth: as in Mitsuba: 1 for emission alone, 2 with direct light.
+        progress: as in `render`.
+        records: the lengths of an earlier run, whose passes are repeated; the budget is not looked at then.
+    """
+    with reporting(progress) as listener:
+        start = clock.perf_counter()
+        if records is None:
+            parts, probed = _probe(scene, plan, max_depth), clock.perf_counter() - start
+            results = _by_budget(scene, choice, plan, parts, start, listener)
+            probes: list[Mapping[str, Any] | None] = [part.probe for part in parts]
+        else:
+            results, probed = _by_records(scene, choice, plan, records, listener), 0.0
+            probes = [record.get("probe") for record in records]
+        elapsed = clock.perf_counter() - start
+    return _sum(scene, choice, plan, max_depth, results, probes, (probed, elapsed))
+
+
+def _probe(scene: Scene, plan: Plan, max_depth: int) -> list[_Part]:
+    # What is hidden from the camera has nothing to render at k = 0.
+    first = 1 if scene.hide_emitters and max_depth > 1 else 0
+    lengths = []
+    for k in range(first, max_depth):
+        strategy = "nee"
+        if k > 0:
+            strategy, _ = scene.resolve_strategy(
+                plan.emitter_strategy, k, plan.parametrisation, plan.threads or None
+            )
+        lengths.append((k, strategy))
+    probes = json.loads(
+        scene.core.lengths(
+            lengths,
+            spp=float(plan.spp or 1),
+            parametrisation=plan.parametrisation,
+            threads=plan.threads,
+        )
+    )
+    return [_Part(k, strategy, probe) for (k, strategy), probe in zip(lengths, probes, strict=True)]
+
+
+def _by_budget(
+    scene: Scene,
+    choice: Choice,
+    plan: Plan,
+    parts: Sequence[_Part],
+    start: float,
+    listener: Listener | None,
+) -> list[Result]:
+    from .render import run
+
+    results: list[Result] = []
+    total = sum(part.cost for part in parts)
+    done = 0.0
+    for part in parts:
+        own = replace(plan, k=max(part.k, 0), emitter_strategy=part.strategy, seed=_seed(plan, part.k))
+        if plan.time is None:
+            own = replace(own, spp=max(round(part.probe["spp"]), 1))
+        else:
+            # What a part leaves or takes too much is shared by those after it.
+            left = max(plan.time - (clock.perf_counter() - start), 1e-3)
+            own = replace(own, time=max(left * part.cost / max(total - done, 1e-9), 1e-3))
+        guide = choice
+        if part.k == 0 or _too_few(choice, own):
+            guide = choose("none", {})
+        elif own.pilot_spp is not None and own.spp is not None:
+            own = replace(own, pilot_spp=min(own.pilot_spp, max(own.spp - 1, 1)))
+        span = (done / total, (done + part.cost) / total)
+        results.append(run(scene, guide, own, _within(listener, span)))
+        done += part.cost
+    return results
+
+
+def _by_records(
+    scene: Scene,
+    choice: Choice,
+    plan: Plan,
+    records: Sequence[Mapping[str, Any]],
+    listener: Listener | None,
+) -> list[Result]:
+    from .render import run
+
+    results = []
+    for i, record in enumerate(records):
+        own = replace(
+            plan,
+            k=record["k"],
+            emitter_strategy=record["emitter_strategy"],
+            seed=record["seed"],
+            uniform_fraction=record["a"],
+            replay=[dict(entry) for entry in record["passes"]],
+            spp=None,
+            time=None,
+        )
+        guide = choice if record["guide"] != "none" else choose("none", {})
+        span = (i / len(records), (i + 1) / len(records))
+        results.append(run(scene, guide, own, _within(listener, span)))
+    return results
+
+
+def _too_few(choice: Choice, plan: Plan) -> bool:
+    """Whether a length's samples leave none for a guide after its pilot; `auto` copes with that itself."""
+    return choice.learns and choice.kind != "auto" and plan.spp is not None and plan.spp < 2
+
+
+def _seed(plan: Plan, k: int) -> int:
+    return (plan.seed + k * ODD) % 2**64
+
+
+def _within(listener: Listener | None, span: tuple[float, float]) -> Listener | bool:
+    """One bar for all lengths; those of the parts would come and go."""
+    if listener is None:
+        return False
+
+    def report(phase: str, share: float) -> None:
+        # Pilot and training are short beside the passes after them.
+        within = share if phase == "render" else 0.0
+        listener("render", span[0] + (span[1] - span[0]) * within)
+
+    return report
+
+
+def share_layer(result: Result) -> Any:
+    """Share of the paths through each pixel that carried light, (H, W, 3), grey."""
+    share = result.nonzero / np.maximum(result.found, 1)
+    return np.repeat(share.astype(np.float32)[..., None], 3, axis=2)
+
+
+def _sum(
+    scene: Scene,
+    choice: Choice,
+    plan: Plan,
+    max_depth: int,
+    parts: Sequence[Result],
+    probes: Sequence[Mapping[str, Any] | None],
+    seconds: tuple[float, float],
+) -> Result:
+    from .render import Result
+
+    image = np.sum([part.image for part in parts], axis=0, dtype=np.float32)
+    variance = np.sum([part.variance for part in parts], axis=0, dtype=np.float32)
+    found, nonzero = (
+        np.sum([getattr(part, name) for part in parts], axis=0, dtype=np.uint32)
+        for name in ("found", "nonzero")
+    )
+    stats = [part.stats for part in parts]
+    timings = dict(scene.timings)
+    for name in ("pilot", "fit", "render"):
+        timings[name] = sum(record["seconds"][name] for record in stats)
+    timings["probe"] = seconds[0]
+    mean = image.mean(axis=(0, 1), dtype=np.float64)
+    lengths = []
+    for record, probe in zip(stats, probes, strict=True):
+        told = {"spp": sum(entry["spp"] for entry in record["passes"])}
+        lengths.append(record | told | {"probe": None if probe is None else dict(probe)})
+    counts = {name: sum(record[name] for record in stats) for name in COUNTS}
+    guided = [record for record in stats if record["chosen"] != "none"]
+    heaviest = [record["max_contribution"] * _luminance(record["mean"]) for record in stats]
+    brightness = _luminance(mean)
+    relative = metrics.relative_variance(variance, image) if image.any() else None
+    notes = [note for note in dict.fromkeys(n for r in stats for n in r["notes"]) if not _of_one(note)]
+    if not image.any():
+        notes.append("the image is black: no path of any length carried light")
+    record: dict[str, Any] = {
+        "scene": scene.name,
+        "guide": choice.label,
+        "chosen": ", ".join(f"k={r['k']}: {r['chosen']}" for r in guided) or "none",
+        **counts,
+        "nonzero_share": counts["nonzero"] / max(counts["paths_found"], 1),
+        "max_depth": max_depth,
+        "k": None,
+        "a": min((r["a"] for r in guided), default=1.0),
+        "parametrisation": plan.parametrisation,
+        "emitter_strategy": plan.emitter_strategy,
+        "seed": plan.seed,
+        "threads": stats[0]["threads"],
+        "mean": mean.tolist(),
+        "variance": None if relative is None else metrics.finite_or_none(relative),
+        "max_weight": max(r["max_weight"] for r in stats),
+        "max_contribution": max(heaviest) / brightness if brightness > 0 else 0.0,
+        "ess": None,
+        "passes": [],
+        "combine": plan.combine,
+        "candidates": None,
+        "training": None,
+        "lengths": lengths,
+        "relmse": None,
+        "relmse_trimmed": None,
+        "notes": notes,
+        "seconds": {**timings, "total": sum(timings.values())},
+        "elapsed": seconds[1],
+        "budget": plan.budget(learns=False) + (" for each length" if plan.time is None else ""),
+        "guide_options": choice.options,
+        "keep_pilot": plan.keep_pilot,
+        "version": _core.__version__,
+        "variant": scene.variant,
+    }
+    layers = {f"k{part.stats['k']}": part.image for part in parts}
+    whole = Result(image, variance, found, nonzero, record, timings, None, parts=tuple(parts), layers=layers)
+    return replace(whole, layers=layers | {"nonzero_share": share_layer(whole)})
+
+
+COUNTS = ("camera_rays", "paths_found", "nonzero", "outside", "non_finite")
+
+
+def _luminance(rgb: Any) -> float:
+    return float(np.asarray(rgb, np.float64) @ LUMINANCE)
+
+
+def _of_one(note: str) -> bool:
+    """Whether a note speaks of a part only: that there is no light of some length is no news."""
+    return note.startswith("the image is black")
+
+

@@ -1,0 +1,180 @@
+"""`max_depth`: the whole light as a sum of path lengths. Its mean is tested in `tests/statistical/test_light.py`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import pssflow
+from pssflow.cli import main
+from tests import scenes
+
+XML = str(Path(__file__).parents[2] / "scenes" / "cornell-box" / "scene.xml")
+
+
+@pytest.fixture
+def scene(llvm_variant: str) -> pssflow.Scene:
+    return pssflow.Scene(mi.load_dict(scenes.furnace_sphere()))
+
+
+def _render(scene: Any, guide: str = "table", **options: Any) -> pssflow.Result:
+    return pssflow.render(scene, guide, progress=False, **({"max_depth": 4} | options))
+
+
+def test_the_image_is_the_sum_of_its_lengths(scene):
+    result = _render(scene, spp=8, seed=3)
+    assert [part.stats["k"] for part in result.parts] == [0, 1, 2, 3]
+    for name in ("image", "variance"):
+        total = np.sum([getattr(part, name) for part in result.parts], axis=0, dtype=np.float32)
+        np.testing.assert_array_equal(getattr(result, name), total)
+    assert result.stats["nonzero"] == sum(part.stats["nonzero"] for part in result.parts)
+    np.testing.assert_array_equal(result.layers["k2"], result.parts[2].image)
+    assert 0 < result.layers["nonzero_share"].mean() <= 1
+
+
+def test_a_length_is_the_render_of_its_k(scene):
+    """What `k` renders alone is what it adds to the whole: nothing is shared that could bias it."""
+    part = _render(scene, spp=8, seed=3).parts[2]
+    alone = pssflow.render(
+        scene, "table", spp=_spp(part), k=2, seed=part.stats["seed"], progress=False
+    )
+    np.testing.assert_array_equal(part.image, alone.image)
+
+
+def test_lengths_draw_numbers_of_their_own(scene):
+    assert len({part.stats["seed"] for part in _render(scene, spp=4, seed=7).parts}) == 4
+
+
+def test_samples_go_where_they_lower_the_error(scene):
+    """All lengths together cost what `spp` of each would, rounding aside, and none gets less than an eighth."""
+    stats = _render(scene, spp=64).stats
+    probes = [length["probe"] for length in stats["lengths"]]
+    cost = sum(length["spp"] * length["probe"]["rays"] for length in stats["lengths"])
+    whole = sum(64 * probe["rays"] for probe in probes)
+    assert abs(cost - whole) <= sum(probe["rays"] for probe in probes)
+    shares = np.array([length["spp"] for length in stats["lengths"]])
+    assert shares.min() >= 8
+    error = [probe["variance"] / probe["rays"] for probe in probes]
+    assert np.argmax(shares) == np.argmax(error)
+
+
+def test_one_seed_gives_one_image_on_any_number_of_threads(scene):
+    a, b = (_render(scene, "auto", spp=8, threads=threads).image for threads in (1, 2))
+    np.testing.assert_array_equal(a, b)
+
+
+def test_what_the_camera_sees_shine(scene):
+    """At depth 1 there are lamps alone: in `quad`, white squares of radiance 6 where the lamp is seen from below."""
+    view = scenes.quad() | {"floor": {"type": "rectangle", "emitter": {"type": "area", "radiance": 6.0}}}
+    image = _render(mi.load_dict(view), "none", max_depth=1, spp=4).image
+    assert np.unique(np.round(image, 4)).max() == 6.0
+    truth = np.array(mi.render(mi.load_dict(view), integrator=mi.load_dict({"type": "path", "max_depth": 1}), spp=64))
+    assert abs(image.mean() - truth.mean()) < 0.02 * truth.mean()
+
+
+@pytest.mark.parametrize("budget", [{"spp": 8}, {"time": 0.5}])
+def test_a_recorded_run_is_repeated(scene, budget):
+    """Also where time decided: the passes of every length are in the record."""
+    first = _render(scene, "auto", **budget)
+    record = json.loads(json.dumps(first.stats))
+    again = pssflow.render(scene, replay=record, progress=False)
+    np.testing.assert_array_equal(first.image, again.image)
+    assert again.stats["max_depth"] == 4
+    with pytest.raises(ValueError, match="`max_depth` was given"):
+        pssflow.render(scene, replay=record["lengths"][2]["passes"], max_depth=4, progress=False)
+
+
+def test_progress_is_one_bar(scene):
+    told: list[tuple[str, float]] = []
+    pssflow.render(scene, "none", 2, max_depth=3, progress=lambda *a: told.append(a))
+    assert {phase for phase, _ in told} <= {"render"}
+    shares = [share for _, share in told]
+    assert shares == sorted(shares)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"max_depth": -1}, "`max_depth` = -1: paths of any length are not supported"),
+        ({"max_depth": 0}, "`max_depth` = 0: expected an integer between 1 and 33"),
+        ({"max_depth": 3, "k": 2}, "`k` = 2 and `max_depth` = 3 were both given"),
+        ({"max_depth": 3, "preset": "thesis"}, "`preset` = 'thesis' renders light of one k"),
+        ({"max_depth": 3, "time": 1.0, "snapshots": (0.5,)}, "`snapshots` are not supported"),
+    ],
+)
+def test_what_cannot_be(scene, options, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        pssflow.render(scene, progress=False, **options)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_fitted_guide_is_for_one_k(scene):
+    guide = pssflow.render(scene, "direction-table", 4, progress=False).guide
+    with pytest.raises(ValueError, match="a fitted guide is for paths of one length"):
+        pssflow.render(scene, guide, 4, max_depth=3, progress=False)
+
+
+# --- the command -----------------------------------------------------------------------------------------------------
+
+
+def _command(*arguments: str) -> int:
+    return main([*arguments])
+
+
+def test_the_command_writes_a_layer_for_each_length(tmp_path, capsys):
+    target = tmp_path / "all.exr"
+    small = ("--size", "16", "16", "-q")
+    assert _command("render", XML, "--max-depth", "3", "--spp", "4", *small, "-o", str(target)) == 0
+    assert "all light to depth 3" in capsys.readouterr().out
+    layers = pssflow._core.read_exr(str(target))
+    names = ("R", "k0.R", "k1.G", "k2.B", "variance.R", "nonzero_share.R")
+    assert set(names) <= layers.keys()
+    total = sum(layers[f"k{k}.G"] for k in range(3))
+    np.testing.assert_allclose(layers["G"], total, rtol=1e-6)
+    again = tmp_path / "again.exr"
+    replay = ("--replay", str(target.with_suffix(".json")))
+    assert _command("render", XML, *replay, *small, "-o", str(again)) == 0
+    np.testing.assert_array_equal(pssflow._core.read_exr(str(again))["R"], layers["R"])
+
+
+def test_the_command_refuses_both(tmp_path, capsys):
+    arguments = ("render", XML, "--k", "2", "--max-depth", "3", "-o", str(tmp_path / "x.exr"))
+    assert _command(*arguments) != 0
+    assert "--max-depth" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+# --- the plugin ------------------------------------------------------------------------------------------------------
+
+
+def test_the_plugin_is_the_function(variant):
+    scene = mi.load_dict(scenes.furnace_sphere())
+    integrator: Any = mi.load_dict({"type": "pssflow", "guide": "table", "max_depth": 3})
+    rendered = np.array(mi.render(scene, integrator=integrator, spp=4, seed=2), np.float32)
+    expected = _render(scene, max_depth=3, spp=4, seed=2)
+    np.testing.assert_array_equal(rendered, expected.image)
+    assert "max_depth = 3" in str(integrator)
+
+
+def test_the_plugins_channels(llvm_variant):
+    scene = mi.load_dict(scenes.furnace_sphere())
+    integrator: Any = mi.load_dict({"type": "pssflow", "guide": "none", "max_depth": 3, "aovs": True})
+    image = np.array(mi.render(scene, integrator=integrator, spp=2), np.float32)
+    names = integrator.aov_names()
+    assert image.shape[2] == 3 + len(names)
+    assert names[0] == "k0.R" and names[-1] == "nonzero_share.B"
+    for i, layer in enumerate(("k0", "k1", "k2")):
+        np.testing.assert_array_equal(
+            image[..., 3 + 3 * i : 6 + 3 * i], integrator.result.layers[layer]
+        )
+    with pytest.raises(Exception, match="`k` and `max_depth` were both given"):
+        mi.load_dict({"type": "pssflow", "k": 2, "max_depth": 3})
+
+
+def _spp(part: pssflow.Result) -> int:
+    return sum(entry["spp"] for entry in part.stats["passes"])
