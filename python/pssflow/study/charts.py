@@ -11,18 +11,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ..files import write_beside
 from ..metrics import Estimate
 from ..report import scene_title
+from .drawing import COLOURS, LINES, MARKERS, MUTED, finish, new_figure, plain_ticks
 from .store import Row
 from .summary import BASELINE, Cell, Overall
 
 __all__ = ["error_chart", "ratio_chart", "style"]
-
-COLOURS = ("#000000", "#e69f00", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#7f7f7f")
-MARKERS = "osD^vPX*<>h"  # not as many as colours: what has the same colour has another marker
-LINES = ("-", "--", "-.", (0, (1, 1)), (0, (5, 1)), (0, (3, 1, 1, 1, 1, 1)))
-MUTED = "#666666"
 
 NOISY = ("relmse", "relmse_trimmed")
 """Measures from which the reference's variance is subtracted."""
@@ -62,7 +57,7 @@ def error_chart(
     scenes = list(dict.fromkeys(row.scene for row in rows))
     columns = min(3, len(scenes))
     lines = math.ceil(len(scenes) / columns)
-    figure = _figure(3.5 * columns + 0.7, 2.9 * lines + 2.1)
+    figure = new_figure(3.5 * columns + 0.7, 2.9 * lines + 2.1)
     for i, scene in enumerate(scenes):
         axes = figure.add_subplot(lines, columns, i + 1)
         own = [row for row in rows if row.scene == scene]
@@ -86,7 +81,7 @@ def error_chart(
         handles.append(
             Line2D([], [], color=MUTED, linestyle="--", label="the reference’s own variance")
         )
-    return _finish(figure, path, title, handles, caption)
+    return finish(figure, path, title, handles, caption)
 
 
 def ratio_chart(
@@ -107,7 +102,7 @@ def ratio_chart(
     others = [method for method in methods if method != BASELINE]
     labels = [*(scene_title(scene) for scene in scenes), "geometric mean"]
     height = 0.16 * max(len(others), 2) + 0.1
-    figure = _figure(3.6 * len(times) + 1.6, height * len(labels) + 2.2)
+    figure = new_figure(3.6 * len(times) + 1.6, height * len(labels) + 2.2)
     first = None
     for i, time in enumerate(times):
         axes = figure.add_subplot(1, len(times), i + 1, sharex=first, sharey=first)
@@ -143,7 +138,7 @@ def ratio_chart(
                 axes.axhspan(row - 0.5, row + 0.5, color="#f2f2f2", zorder=0)
         axes.axhline(len(scenes) - 0.5, color=MUTED, linewidth=1)
         axes.set_xscale("log")
-        _plain_ticks(axes.xaxis)
+        plain_ticks(axes.xaxis)
         axes.set_ylim(len(labels) - 0.5, -0.5)
         axes.set_yticks(range(len(labels)), labels)
         axes.tick_params(axis="y", length=0, labelleft=i == 0)
@@ -154,7 +149,7 @@ def ratio_chart(
         )
         axes.grid(axis="x", which="both", color="#dddddd", linewidth=0.5)
         axes.set_axisbelow(True)
-    return _finish(figure, path, title, _legend_handles(others, methods), caption)
+    return finish(figure, path, title, _legend_handles(others, methods), caption)
 
 
 def _curve(axes: Any, rows: Sequence[Row], measure: str, look: dict[str, Any]) -> None:
@@ -205,26 +200,17 @@ def _guides(axes: Any, rows: Sequence[Row], measure: str) -> None:
 
 
 def _scene_axes(axes: Any, title: str, label: str, last: bool) -> None:
-    _plain_ticks(axes.xaxis)
+    plain_ticks(axes.xaxis)
     axes.set_title(title, fontsize=10)
     axes.set_ylabel(label)
     if last:
         axes.set_xlabel("wall time used (s)")
     low, high = axes.get_ylim()
     if low > 1e-3 and high < 1e3 and high < 100.0 * low:
-        _plain_ticks(axes.yaxis)
+        plain_ticks(axes.yaxis)
     axes.grid(which="both", color="#e3e3e3", linewidth=0.5)
     axes.set_axisbelow(True)
     axes.tick_params(labelsize=8, which="both")
-
-
-def _plain_ticks(axis: Any) -> None:
-    """1, 3, 10 in place of 10⁰, 10¹: decades alone leave most of these axes without a number."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    axis.set_major_locator(LogLocator(10, subs=(1.0, 2.0, 5.0), numticks=12))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set_minor_formatter(NullFormatter())
 
 
 def _bars(estimate: Estimate) -> tuple[float, float]:
@@ -242,48 +228,3 @@ def _legend_handles(methods: Sequence[str], all_methods: Sequence[str] | None = 
     return [
         Line2D([], [], label=method, **style(known, method), markersize=5) for method in methods
     ]
-
-
-def _figure(width: float, height: float) -> Any:
-    # No pyplot: it would pick a window system and keep figures alive.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(max(width, 6.4), height), dpi=150, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _finish(
-    figure: Any, path: Path, title: str, handles: Sequence[Any], caption: str
-) -> list[Path]:
-    """Title, legend and caption; then both files."""
-    import textwrap
-
-    width = figure.get_figwidth()
-    wrapped = "\n".join(textwrap.wrap(title, int(width * 11)))
-    figure.suptitle(wrapped, fontsize=11, x=0.01, ha="left")
-    # The caption is the legend's heading: text of its own would lie over the legend.
-    legend = figure.legend(
-        handles=list(handles),
-        loc="outside lower left",
-        ncols=max(1, int(width // 2.1)),
-        fontsize=8.5,
-        frameon=False,
-        title="\n".join(textwrap.wrap(caption, int(width * 14))) or None,
-        title_fontsize=7.5,
-        alignment="left",
-    )
-    legend.get_title().set_color(MUTED)
-    written = [path.with_suffix(".png"), path.with_suffix(".svg")]
-    for target in written:
-        kind = target.suffix[1:]
-        # Without a date two runs over the same rows give the same file.
-        metadata = {"Date": None} if kind == "svg" else None
-        write_beside(
-            target,
-            lambda part, kind=kind, metadata=metadata: figure.savefig(
-                part, format=kind, metadata=metadata
-            ),
-        )
-    return written

@@ -290,7 +290,7 @@ class Study:
                 truth = truth or read_exr(reference)
                 images = [read_exr(path).image for path in paths]
                 found[scenery.name, method.name] = metrics.floor(
-                    images, truth.image, truth.variance
+                    images, truth.image, truth.variance, scale=metrics.local_scale(truth.image)
                 )
         return found
 
@@ -302,11 +302,15 @@ def measured(shot: Shot, truth: Reference, common: Mapping[str, Any]) -> Row:
         ValueError: the image and the truth differ in size.
     """
     height, width = shot.image.shape[:2]
+    scale = metrics.local_scale(truth.image)
     own = None
     if shot.variance is not None and np.isfinite(shot.variance).all():
-        own = metrics.finite_or_none(metrics.relative_variance(shot.variance, truth.image))
+        own = metrics.finite_or_none(
+            metrics.relative_variance(shot.variance, truth.image, scale=scale)
+        )
     phases: dict[str, Any] = {f"seconds_{phase}": shot.seconds.get(phase) for phase in PHASES}
-    error = metrics.relmse_with_error(shot.image, truth.image, truth.variance)
+    against = (shot.image, truth.image, truth.variance)
+    error = metrics.relmse_with_error(*against, scale=scale)
     return Row(
         **common,
         time=shot.time,
@@ -320,11 +324,12 @@ def measured(shot: Shot, truth: Reference, common: Mapping[str, Any]) -> Row:
         nonzero_share=shot.nonzero_share,
         relmse=error.value,
         relmse_error=error.error,
-        relmse_trimmed=metrics.relmse_trimmed(shot.image, truth.image, truth.variance),
-        mape=metrics.mape(shot.image, truth.image),
+        relmse_trimmed=metrics.relmse_trimmed(*against, scale=scale),
+        relmse_pixel=metrics.relmse(*against),
+        mape=metrics.mape(shot.image, truth.image, scale=scale),
         flip=flip(shot.image, truth.image),
         own_variance=own,
-        reference_variance=metrics.relative_variance(truth.variance, truth.image),
+        reference_variance=metrics.relative_variance(truth.variance, truth.image, scale=scale),
         reference_seconds=truth.seconds,
     )
 
@@ -348,10 +353,13 @@ def nothing_yet(
         relmse=math.nan,
         relmse_error=math.nan,
         relmse_trimmed=math.nan,
+        relmse_pixel=math.nan,
         mape=math.nan,
         flip=None,
         own_variance=None,
-        reference_variance=metrics.relative_variance(truth.variance, truth.image),
+        reference_variance=metrics.relative_variance(
+            truth.variance, truth.image, scale=metrics.local_scale(truth.image)
+        ),
         reference_seconds=truth.seconds,
     )
 

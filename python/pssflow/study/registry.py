@@ -9,6 +9,10 @@ import click
 __all__ = ["STUDIES", "Studies"]
 
 STUDIES = {
+    "thesis": (
+        "thesis",
+        "The source thesis reproduced: its tables and figures beside ours, and what it left open.",
+    ),
     "guides": (
         "guides",
         "What each guide gains, costs and comes to at equal time; what `auto` chose.",

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from rich.table import Table
@@ -18,21 +19,22 @@ from .charts import NOISY, error_chart, ratio_chart
 from .flip import has_flip
 from .harness import Study
 from .methods import OTHERS
-from .page import Chart, write_page
+from .page import Chart, study_scenes, write_page
 from .store import Row
 from .summary import BASELINE, CLOSE, Cell, Choice, Overall, cells, choices, overall, reaches
 
-__all__ = ["biased", "publish"]
+__all__ = ["Sheet", "biased", "machine_lines", "publish", "rich_table", "write_summary"]
 
 NOTES = """\
-relMSE, and the variance that an image says of itself, are relative to the reference (docs of pssflow.metrics); of
-relMSE the reference's own variance is subtracted, * lies below it. “trimmed” leaves out the worst 0.1 % of pixels,
-which hides fireflies. MAPE and FLIP (HDR-FLIP's mean, 0 … 1) hold the reference's noise. variance × time: the image's
-own, in seconds. Time to an error: where the line of means over seeds crosses it on logarithmic axes, never beyond what
-was measured. Ratios are those of random sampling (none) ÷ the method: above 1 is a gain; but cost is the method's ÷
-random's. gain / path: the images' own variance; equal samples and equal time: relMSE; cost: seconds a path with pilot
-and training inside. ± is one standard error over seeds; win and loss are beyond two. A time shorter than the run is a
-snapshot of it: its pilot was planned for the whole."""
+relMSE, and the variance that an image says of itself, are relative to the square of the reference about each pixel, in
+the mean of its 24 neighbours: by its own square, as is usual (relmse_pixel in results.csv), a noisy reference makes all
+errors too large and all ratios too near 1. Of relMSE the reference's own variance is subtracted, * lies below it.
+“trimmed” leaves out the worst 0.1 % of pixels, which hides fireflies. MAPE and FLIP (HDR-FLIP's mean, 0 … 1) hold the
+reference's noise. variance × time: the image's own, in seconds. Time to an error: where the line of means over seeds
+crosses it on logarithmic axes, never beyond what was measured. Ratios are those of random sampling (none) ÷ the method:
+above 1 is a gain; but cost is the method's ÷ random's. gain / path: the images' own variance; equal samples and equal
+time: relMSE; cost: seconds a path with pilot and training inside. ± is one standard error over seeds; win and loss are
+beyond two. A time shorter than the run is a snapshot of it: its pilot was planned for the whole."""
 
 MEASURES = {
     "relmse": ("error", "Error against time", "relMSE"),
@@ -88,24 +90,37 @@ def publish(study: Study, rows: Sequence[Row], title: str) -> list[Any]:
         *_failures(study),
         *_budgets(rows),
         *([] if has_flip() else ["FLIP is not measured: the package flip-evaluator is missing"]),
-        *_machine(rows or early),
+        *machine_lines([vars(row) for row in rows or early], rows[0].processor, rows[0].mitsuba),
     ]
     heading = title[0].upper() + title[1:]
-    parts = [f"# {heading}"]
-    for sheet in sheets:
-        parts += [
-            f"## {sheet.title}",
-            markdown_table(sheet.headings, sheet.rows, texts=sheet.texts),
-        ]
-    text = "\n\n".join([*parts, NOTES, *lines])
-    write_beside(
-        study.folder / "summary.md", lambda part: part.write_text(text + "\n", encoding="utf-8")
-    )
+    write_summary(study.folder / "summary.md", heading, sheets, [NOTES, *lines])
     charts = _charts(study, rows, methods, found, total, title) if rows else []
-    write_page(study, rows, heading, sheets, charts, lines, NOTES)
-    shown: list[Any] = [_rich(sheet) for sheet in [*sheets[1:], *sheets[:1]]]
+    write_page(
+        study.folder,
+        heading,
+        sheets=sheets,
+        charts=charts,
+        scenes=study_scenes(study, rows),
+        lines=lines,
+        notes=NOTES,
+    )
+    shown: list[Any] = [rich_table(sheet) for sheet in [*sheets[1:], *sheets[:1]]]
     written = f"wrote {study.folder}: report.html, results.csv, summary.md, charts, images"
     return [*shown, NOTES, *lines, written]
+
+
+def write_summary(path: Path, heading: str, sheets: Sequence[Sheet], lines: Sequence[str]) -> None:
+    """Tables and findings as Markdown.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    parts = [f"# {heading}"]
+    for sheet in sheets:
+        table = markdown_table(sheet.headings, sheet.rows, texts=sheet.texts)
+        parts += [f"## {sheet.title}", table]
+    text = "\n\n".join([*parts, *lines])
+    write_beside(path, lambda part: part.write_text(text + "\n", encoding="utf-8"))
 
 
 def _errors(found: Sequence[Cell]) -> Sheet:
@@ -236,7 +251,7 @@ BIAS_SHARE = 0.05
 
 
 NOISY_REFERENCE = 0.1
-"""Relative standard error of a reference above which relMSE itself is off: it divides by the reference's square."""
+"""Relative standard error of a reference above which its noise is told, and random sampling is not called biased."""
 
 
 def biased(study: Study, rows: Sequence[Row]) -> list[str]:
@@ -278,8 +293,9 @@ def _noisy_references(rows: Sequence[Row]) -> list[str]:
         error = _reference_error(rows, scene)
         if error > NOISY_REFERENCE:
             lines.append(
-                f"the reference of {scene_title(scene)} is noisy (relative standard error {number(error, 2)}): "
-                "its relMSE is too large for all methods, and its ratios too near 1; raise --reference-time"
+                f"the reference of {scene_title(scene)} is noisy (relative standard error {number(error, 2)}): its own "
+                "variance is subtracted, but what it has of chance is the same in every relMSE and in no ±; look at "
+                "gain / path, which asks the images alone, or raise --reference-time"
             )
     return lines
 
@@ -319,13 +335,16 @@ def _failures(study: Study) -> list[str]:
     return [f"left out: {name}: {why}" for name, why in study.failures.items()]
 
 
-def _machine(rows: Sequence[Row]) -> list[str]:
-    loads = [max(row.load_before, row.load_after) for row in rows]
-    commits = ", ".join(sorted({row.commit for row in rows}))
+def machine_lines(
+    ran: Sequence[Mapping[str, Any]], processor: str, mitsuba: str | None = None
+) -> list[str]:
+    """Processor, load and commit of runs that have `load_before`, `load_after` and `commit`; crowds are told first."""
+    loads = [max(run["load_before"], run["load_after"]) for run in ran]
+    commits = ", ".join(sorted({run["commit"] for run in ran}))
     mean, cores = sum(loads) / len(loads), os.cpu_count() or 1
     lines = [
-        f"{rows[0].processor}; load average up to {max(loads):.1f}, in the mean {mean:.1f}; "
-        f"commit {commits}; Mitsuba {rows[0].mitsuba}."
+        f"{processor}; load average up to {max(loads):.1f}, in the mean {mean:.1f}; "
+        f"commit {commits}{'' if mitsuba is None else f'; Mitsuba {mitsuba}'}."
     ]
     if mean > CROWDED * cores:
         lines.insert(
@@ -357,7 +376,8 @@ def _budgets(rows: Sequence[Row]) -> list[str]:
     return [f"time of {', '.join(names)}: {budget}" for budget, names in methods.items()]
 
 
-def _rich(sheet: Sheet) -> Table:
+def rich_table(sheet: Sheet) -> Table:
+    """A table for the terminal."""
     table = Table(title=sheet.title, title_justify="left")
     for i, heading in enumerate(sheet.headings):
         table.add_column(heading, justify="left" if i < sheet.texts else "right")

@@ -25,7 +25,7 @@ __all__ = ["Row", "Store", "commit", "configuration", "processor"]
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One image and its errors. Radiances are relative to the reference, as in relMSE (`pssflow.metrics`)."""
+    """One image and its errors, relative to the reference about each pixel (`pssflow.metrics.local_scale`)."""
 
     scene: str
     scene_hash: str
@@ -60,6 +60,9 @@ class Row:
     relmse_error: float
     """Standard error from the spread between pixels."""
     relmse_trimmed: float
+    relmse_pixel: float
+    """RelMSE by its usual formula, ÷ each pixel's own square: comparable with other programs, and off where the
+    reference is noisy."""
     mape: float
     flip: float | None
     """Mean of HDR-FLIP; None where the package `flip-evaluator` is missing."""
