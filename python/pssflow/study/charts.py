@@ -1,4 +1,4 @@
-"""Charts of a study: error against wall time, and ratios at equal time.
+"""Charts of a study: error against wall time or samples, and ratios at equal ones.
 
 Methods are told apart by colour (Okabe and Ito's palette, which colour-blind readers can tell apart), marker and line,
 so that a copy in black and white can be read, too. Every chart is written as PNG and as SVG.
@@ -14,7 +14,7 @@ from typing import Any
 from ..metrics import Estimate
 from ..report import scene_title
 from .drawing import COLOURS, LINES, MARKERS, MUTED, finish, new_figure, plain_ticks
-from .store import Row
+from .store import ALL, Row
 from .summary import BASELINE, Cell, Overall
 
 __all__ = ["error_chart", "ratio_chart", "style"]
@@ -46,8 +46,9 @@ def error_chart(
     label: str = "relMSE",
     caption: str = "",
 ) -> list[Path]:
-    """Error against seconds used, log-log, a panel a scene: means over seeds, and a band from the least to the largest.
+    """Error against seconds used, or samples, log-log, a panel a scene.
 
+    Lines are means over seeds, bands reach from the least to the largest.
     Dotted: the slope with which the measure falls, −1 for relMSE. Below the dashed line, shaded, errors drown in the
     truth's own noise.
 
@@ -55,6 +56,7 @@ def error_chart(
         OSError: a file cannot be written.
     """
     scenes = list(dict.fromkeys(row.scene for row in rows))
+    known, methods = methods, [m for m in methods if any(row.method == m for row in rows)]
     columns = min(3, len(scenes))
     lines = math.ceil(len(scenes) / columns)
     figure = new_figure(3.5 * columns + 0.7, 2.9 * lines + 2.1)
@@ -65,13 +67,17 @@ def error_chart(
         axes.set_yscale("log")
         for method in methods:
             _curve(
-                axes, [row for row in own if row.method == method], measure, style(methods, method)
+                axes, [row for row in own if row.method == method], measure, style(known, method)
             )
         _guides(axes, own, measure)
         _scene_axes(
-            axes, scene_title(scene), label if i % columns == 0 else "", i >= len(scenes) - columns
+            axes,
+            scene_title(scene),
+            label if i % columns == 0 else "",
+            i >= len(scenes) - columns,
+            rows[0].unit,
         )
-    handles = _legend_handles(methods)
+    handles = _legend_handles(methods, known)
     from matplotlib.lines import Line2D
 
     if measure in SLOPES:
@@ -97,6 +103,8 @@ def ratio_chart(
     Raises:
         OSError: a file cannot be written.
     """
+    found = [cell for cell in found if cell.light != ALL]
+    unit = found[0].unit
     times = sorted({cell.time for cell in found})
     scenes = list(dict.fromkeys(cell.scene for cell in found))
     others = [method for method in methods if method != BASELINE]
@@ -109,9 +117,9 @@ def ratio_chart(
         first = first or axes
         for j, method in enumerate(others):
             points: list[tuple[int, Estimate]] = [
-                (scenes.index(cell.scene), cell.equal_time)
+                (scenes.index(cell.scene), cell.gained)
                 for cell in found
-                if (cell.method, cell.time) == (method, time) and cell.equal_time is not None
+                if (cell.method, cell.time) == (method, time) and cell.gained is not None
             ]
             points += [
                 (len(scenes), total.mean)
@@ -142,9 +150,10 @@ def ratio_chart(
         axes.set_ylim(len(labels) - 0.5, -0.5)
         axes.set_yticks(range(len(labels)), labels)
         axes.tick_params(axis="y", length=0, labelleft=i == 0)
-        axes.set_title(f"{time:g} s", fontsize=10)
+        axes.set_title(f"{time:g} {unit}", fontsize=10)
+        equal = "equal time" if unit == "s" else "equal samples"
         axes.set_xlabel(
-            "relMSE of random sampling ÷ of the guide\n(equal time; right of 1 is a gain)",
+            f"relMSE of random sampling ÷ of the method\n({equal}; right of 1 is a gain)",
             fontsize=8.5,
         )
         axes.grid(axis="x", which="both", color="#dddddd", linewidth=0.5)
@@ -162,8 +171,8 @@ def _curve(axes: Any, rows: Sequence[Row], measure: str, look: dict[str, Any]) -
         mean = sum(values) / len(values)
         if mean <= 0.0:
             continue  # drowned: a logarithm has no place for it
-        elapsed = [row.elapsed for row in rows if row.time == time]
-        x.append(sum(elapsed) / len(elapsed))
+        spent = [row.spent for row in rows if row.time == time]
+        x.append(sum(spent) / len(spent))
         y.append(mean)
         low.append(max(min(values), 0.1 * mean))
         high.append(max(values))
@@ -174,7 +183,7 @@ def _curve(axes: Any, rows: Sequence[Row], measure: str, look: dict[str, Any]) -
 
 def _guides(axes: Any, rows: Sequence[Row], measure: str) -> None:
     """The slope, through the middle of what is drawn, and the truth's noise."""
-    values = [(row.elapsed, getattr(row, measure)) for row in rows]
+    values = [(row.spent, getattr(row, measure)) for row in rows]
     positive = [(x, y) for x, y in values if y is not None and y > 0.0]
     if not positive:
         return
@@ -199,12 +208,12 @@ def _guides(axes: Any, rows: Sequence[Row], measure: str) -> None:
             axes.set_ylim(low, high)
 
 
-def _scene_axes(axes: Any, title: str, label: str, last: bool) -> None:
+def _scene_axes(axes: Any, title: str, label: str, last: bool, unit: str) -> None:
     plain_ticks(axes.xaxis)
     axes.set_title(title, fontsize=10)
     axes.set_ylabel(label)
     if last:
-        axes.set_xlabel("wall time used (s)")
+        axes.set_xlabel("wall time used (s)" if unit == "s" else "samples per pixel")
     low, high = axes.get_ylim()
     if low > 1e-3 and high < 1e3 and high < 100.0 * low:
         plain_ticks(axes.yaxis)

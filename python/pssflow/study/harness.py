@@ -28,9 +28,19 @@ from ..output import make_folder
 from ..progress import Progress
 from ..reference import Reference, read_exr
 from .flip import flip
-from .store import Row, Store, commit, configuration, processor
+from .store import ALL, BOUNCES, Row, Store, commit, configuration, processor
 
-__all__ = ["Case", "Method", "Scenery", "Shot", "Study", "image_path", "reference_path"]
+__all__ = [
+    "ALL",
+    "BOUNCES",
+    "Case",
+    "Method",
+    "Scenery",
+    "Shot",
+    "Study",
+    "image_path",
+    "reference_path",
+]
 
 F32 = NDArray[np.float32]
 
@@ -42,10 +52,10 @@ FAILURES = (OSError, ValueError, RuntimeError)
 
 @dataclass(frozen=True)
 class Shot:
-    """What a method had after a time."""
+    """What a method had after a budget."""
 
     time: float
-    """Seconds that were allowed."""
+    """Seconds that were allowed, or samples per pixel."""
     elapsed: float
     """Seconds that were used."""
     image: F32
@@ -60,7 +70,7 @@ class Shot:
 
 
 Runner = Callable[[Any, int, Sequence[float], Progress], Sequence[Shot]]
-"""Renders a case's scene with a seed; returns a shot for each of the increasing times at which there was an image.
+"""Renders a case's scene with a seed; returns a shot for each of the increasing budgets at which there was an image.
 Training is inside them."""
 
 
@@ -74,6 +84,8 @@ class Method:
     """What sets it apart, for the record and the configuration's hash."""
     budget: str = "pilot, training and selection inside"
     """What its time counts."""
+    light: str = BOUNCES
+    """What it renders: only scenes whose truth is that are its own."""
 
 
 @dataclass(frozen=True)
@@ -95,6 +107,8 @@ class Scenery:
 
     name: str
     open: Callable[[], Case]
+    light: str = BOUNCES
+    """What its truth holds."""
 
 
 @dataclass
@@ -105,7 +119,7 @@ class Study:
         folder: where results.csv and the images lie.
         sceneries: the scenes.
         methods: the methods.
-        times: seconds, increasing; a run goes to the last.
+        times: seconds, or samples per pixel, increasing; a run by seconds goes to the last.
         seeds: numbers of the seeds.
         settings: what all runs share, for the rows and the configuration's hash: `k`, `emitter_strategy`, `threads`,
             and whatever else decides a row, as `reference_time`.
@@ -123,6 +137,8 @@ class Study:
     say: Callable[[str], None] = lambda text: None
     progress: Progress = False
     publish: Callable[[Sequence[Row]], object] = lambda rows: None
+    unit: str = "s"
+    """Of the times: `s`, or `spp` for samples per pixel."""
 
     def __post_init__(self) -> None:
         make_folder(self.folder / "images")
@@ -155,17 +171,18 @@ class Study:
         Raises:
             KeyboardInterrupt: on Ctrl-C; finished runs are kept.
         """
-        clock = _Clock(len(self.sceneries) * len(self.methods) * len(self.seeds), self.times[-1])
+        runs = sum(len(self.methods_of(s)) for s in self.sceneries) * len(self.seeds)
+        clock = _Clock(runs, self.times[-1] if self.unit == "s" else 0.0)
         try:
             for scenery in self.sceneries:
                 try:
                     case = scenery.open()
                 except FAILURES as error:
                     self._leave_out(scenery.name, error)
-                    clock.skip(len(self.methods) * len(self.seeds))
+                    clock.skip(len(self.methods_of(scenery)) * len(self.seeds))
                     continue
                 self._digests[scenery.name] = case.digest
-                ran = self._scene(scenery.name, case, clock)
+                ran = self._scene(scenery, case, clock)
                 if ran and scenery is not self.sceneries[-1]:
                     self.publish(self.rows)
         except KeyboardInterrupt:
@@ -183,16 +200,22 @@ class Study:
             method=method.name,
             options=method.options,
             times=list(self.times),
+            unit=self.unit,
             seed=seed,
             settings=dict(self.settings),
         )
 
-    def _scene(self, name: str, case: Case, clock: _Clock) -> bool:
+    def methods_of(self, scenery: Scenery) -> list[Method]:
+        """Those that render what the scene's truth holds."""
+        return [method for method in self.methods if method.light == scenery.light]
+
+    def _scene(self, scenery: Scenery, case: Case, clock: _Clock) -> bool:
         """The runs of one scene; whether there were any."""
+        name, methods = scenery.name, self.methods_of(scenery)
         wanted = []
         for turn, seed in enumerate(self.seeds):
-            shift = turn % len(self.methods)
-            for method in [*self.methods[shift:], *self.methods[:shift]]:
+            shift = turn % max(len(methods), 1)
+            for method in [*methods[shift:], *methods[:shift]]:
                 wanted.append((method, seed, self._key(name, case.digest, method, seed)))
         missing = [run for run in wanted if not self.store.has(run[2])]
         clock.skip(len(wanted) - len(missing))
@@ -239,6 +262,8 @@ class Study:
             "method": method.name,
             "budget": method.budget,
             "seed": seed,
+            "unit": self.unit,
+            "light": method.light,
             "longest": self.times[-1],
             "k": self.settings["k"],
             "emitter_strategy": self.settings["emitter_strategy"],
@@ -260,12 +285,12 @@ class Study:
             # What one sample a pixel says of its variance is infinite, which no reader likes.
             if shot.variance is not None and np.isfinite(shot.variance).all():
                 layers["variance"] = shot.variance
-            path = image_path(self.folder, name, method.name, seed, shot.time)
+            path = image_path(self.folder, name, method.name, seed, shot.time, self.unit)
             _core.write_exr(str(path), layers)
 
     def image_path(self, row: Row) -> Path:
         """Where a row's image lies; of seeds after the first only the last one is kept."""
-        return image_path(self.folder, row.scene, row.method, row.seed, row.time)
+        return image_path(self.folder, row.scene, row.method, row.seed, row.time, row.unit)
 
     def reference_path(self, scene: str) -> Path:
         """Where a scene's truth lies."""
@@ -283,7 +308,7 @@ class Study:
                 runs = [(scenery.name, method.name, seed) for seed in self.seeds]
                 if any(run not in done for run in runs):
                     continue
-                paths = [image_path(self.folder, *run, self.times[-1]) for run in runs]
+                paths = [image_path(self.folder, *run, self.times[-1], self.unit) for run in runs]
                 reference = reference_path(self.folder, scenery.name)
                 if not all(path.is_file() for path in (*paths, reference)):
                     continue
@@ -364,9 +389,12 @@ def nothing_yet(
     )
 
 
-def image_path(folder: Path, scene: str, method: str, seed: int, seconds: float) -> Path:
+def image_path(
+    folder: Path, scene: str, method: str, seed: int, budget: float, unit: str = "s"
+) -> Path:
     """Where an image of a run lies."""
-    return folder / "images" / f"{file_name(scene)}-{file_name(method)}-s{seed}-{seconds:g}s.exr"
+    name = f"{file_name(scene)}-{file_name(method)}-s{seed}-{budget:g}{unit}"
+    return folder / "images" / f"{name}.exr"
 
 
 def reference_path(folder: Path, scene: str) -> Path:

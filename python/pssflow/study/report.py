@@ -20,7 +20,7 @@ from .flip import has_flip
 from .harness import Study
 from .methods import OTHERS
 from .page import Chart, study_scenes, write_page
-from .store import Row
+from .store import ALL, Row
 from .summary import BASELINE, CLOSE, Cell, Choice, Overall, cells, choices, overall, reaches
 
 __all__ = ["Sheet", "biased", "machine_lines", "publish", "rich_table", "write_summary"]
@@ -30,11 +30,13 @@ relMSE, and the variance that an image says of itself, are relative to the squar
 the mean of its 24 neighbours: by its own square, as is usual (relmse_pixel in results.csv), a noisy reference makes all
 errors too large and all ratios too near 1. Of relMSE the reference's own variance is subtracted, * lies below it.
 “trimmed” leaves out the worst 0.1 % of pixels, which hides fireflies. MAPE and FLIP (HDR-FLIP's mean, 0 … 1) hold the
-reference's noise. variance × time: the image's own, in seconds. Time to an error: where the line of means over seeds
-crosses it on logarithmic axes, never beyond what was measured. Ratios are those of random sampling (none) ÷ the method:
-above 1 is a gain; but cost is the method's ÷ random's. gain / path: the images' own variance; equal samples and equal
-time: relMSE; cost: seconds a path with pilot and training inside. ± is one standard error over seeds; win and loss are
-beyond two. A time shorter than the run is a snapshot of it: its pilot was planned for the whole."""
+reference's noise. variance × budget: the image's own, in seconds or samples. Time (samples) to an error: where the line
+of means over seeds crosses it on logarithmic axes, never beyond what was measured. Ratios are those of random sampling
+(none) ÷ the method: above 1 is a gain; but cost is the method's ÷ random's. gain / path: the images' own variance;
+equal samples and equal time: relMSE; cost: seconds a path with pilot and training inside. ± is one standard error over seeds;
+win and loss are beyond two, at equal time or, where the budget is samples, at equal samples. A time shorter than the
+run is a snapshot of it: its pilot was planned for the whole. “All light” is Mitsuba's path against its own reference:
+it renders something else than the others, and is compared with none of them."""
 
 MEASURES = {
     "relmse": ("error", "Error against time", "relMSE"),
@@ -77,14 +79,14 @@ def publish(study: Study, rows: Sequence[Row], title: str) -> list[Any]:
     total = overall(found)
     picked = choices(found, competitors=OTHERS) if "auto" in methods else []
     sheets = [
-        *([_sums(total)] if total else []),
+        *([_sums(total, study.unit)] if total else []),
         _errors(found),
         *([_ratios(found)] if total else []),
-        _times_to_errors(found),
+        *([sheet] if (sheet := _times_to_errors(found, study.unit)).rows else []),
     ]
     lines = [
         *biased(study, rows),
-        *_choice_lines(picked),
+        *_choice_lines(picked, study.unit),
         *_too_early(early),
         *_noisy_references(rows),
         *_failures(study),
@@ -103,6 +105,7 @@ def publish(study: Study, rows: Sequence[Row], title: str) -> list[Any]:
         scenes=study_scenes(study, rows),
         lines=lines,
         notes=NOTES,
+        unit=study.unit,
     )
     shown: list[Any] = [rich_table(sheet) for sheet in [*sheets[1:], *sheets[:1]]]
     written = f"wrote {study.folder}: report.html, results.csv, summary.md, charts, images"
@@ -125,14 +128,14 @@ def write_summary(path: Path, heading: str, sheets: Sequence[Sheet], lines: Sequ
 
 def _errors(found: Sequence[Cell]) -> Sheet:
     headings = (
-        *("scene", "method", "time", "spp", "relMSE", "trimmed", "MAPE", "FLIP", "non-zero"),
-        *("own variance", "variance × time"),
+        *("scene", "method", "budget", "spp", "relMSE", "trimmed", "MAPE", "FLIP", "non-zero"),
+        *("own variance", "variance × budget"),
     )
     table = [
         [
             scene_title(cell.scene),
             cell.method + (f" → {_names(cell.chosen)}" if cell.method == "auto" else ""),
-            f"{cell.time:g} s",
+            f"{cell.time:g} {cell.unit}",
             number(cell.spp, 3),
             with_error(cell.relmse) + ("*" if cell.drowned else ""),
             with_error(cell.relmse_trimmed),
@@ -149,14 +152,14 @@ def _errors(found: Sequence[Cell]) -> Sheet:
 
 def _ratios(found: Sequence[Cell]) -> Sheet:
     headings = (
-        *("scene", "method", "time", "gain / path", "cost / path", "equal samples"),
+        *("scene", "method", "budget", "gain / path", "cost / path", "equal samples"),
         *("equal time", "verdict"),
     )
     table = [
         [
             scene_title(cell.scene),
             cell.method,
-            f"{cell.time:g} s",
+            f"{cell.time:g} {cell.unit}",
             with_error(cell.gain),
             with_error(cell.cost),
             with_error(cell.equal_samples),
@@ -164,12 +167,12 @@ def _ratios(found: Sequence[Cell]) -> Sheet:
             cell.verdict,
         ]
         for cell in found
-        if cell.method != BASELINE
+        if cell.method != BASELINE and cell.gained is not None
     ]
     return Sheet("Ratios to random sampling", headings, table)
 
 
-def _times_to_errors(found: Sequence[Cell]) -> Sheet:
+def _times_to_errors(found: Sequence[Cell], unit: str) -> Sheet:
     """A row for each scene and error, a column for each method."""
     known = reaches(found)
     methods = list(dict.fromkeys(reach.method for reach in known))
@@ -188,18 +191,20 @@ def _times_to_errors(found: Sequence[Cell]) -> Sheet:
         ]
         for scene, target in places
     ]
-    return Sheet("Time to an error", ("scene", "relMSE", *methods), table, texts=1)
+    what = "Time to an error" if unit == "s" else "Samples to an error"
+    return Sheet(what, ("scene", "relMSE", *methods), table, texts=1)
 
 
-def _sums(total: Sequence[Overall]) -> Sheet:
+def _sums(total: Sequence[Overall], unit: str) -> Sheet:
+    equal = "equal time" if unit == "s" else "equal samples"
     headings = (
-        *("method", "time", "scenes", "equal time, geometric mean", "gain / path"),
+        *("method", "budget", "scenes", f"{equal}, geometric mean", "gain / path"),
         *("wins / ties / losses", "worst"),
     )
     table = [
         [
             o.method,
-            f"{o.time:g} s",
+            f"{o.time:g} {unit}",
             str(o.scenes),
             with_error(o.mean),
             with_error(o.gain),
@@ -223,18 +228,32 @@ def _charts(
     seeds = "1 seed" if len(study.seeds) == 1 else f"{len(study.seeds)} seeds"
     where = f"{rows[0].width}×{rows[0].height} pixels and the like, {seeds}, {rows[0].processor}"
     charts = []
+    everything = [row for row in rows if row.light == ALL]
+    rows = [row for row in rows if row.light != ALL]
     for measure, (name, heading, label) in MEASURES.items():
         if all(getattr(row, measure) is None for row in rows):
             continue
+        heading = heading.replace("time", "samples") if study.unit == "spp" else heading
         noise = "" if measure in NOISY else " It holds the reference’s noise."
         bands = "lines are means over seeds, bands reach from the least to the largest. "
         bands = bands if len(study.seeds) > 1 else ""
-        caption = f"{where}; {bands}points lie at the seconds really used.{noise}"
+        used = "points lie at the seconds really used." if study.unit == "s" else ""
+        caption = f"{where}; {bands}{used}{noise}"
         path = study.folder / f"{name}.png"
         heading = f"{heading}: {title}"
         error_chart(path, heading, rows, methods, measure=measure, label=label, caption=caption)
         charts.append(Chart(path.with_suffix(".svg"), heading, first=measure == "relmse"))
-    if any(method != BASELINE for method in methods) and any(c.equal_time for c in found):
+    if everything:
+        path = study.folder / "error-all-light.png"
+        heading = (
+            "All light: Mitsuba's path against its own reference; "
+            + title.partition(";")[2].strip()
+        )
+        caption = f"{where}. Another quantity than in the other charts, hence not to be compared with them."
+        error_chart(path, heading, everything, methods, caption=caption)
+        charts.append(Chart(path.with_suffix(".svg"), heading))
+    methods = [method for method in methods if any(row.method == method for row in rows)]
+    if any(method != BASELINE for method in methods) and any(c.gained for c in found):
         path = study.folder / "ratio.png"
         heading = f"Gain over random sampling: {title}"
         bars = f"Bars: two standard errors over {seeds}. {rows[0].processor}."
@@ -269,8 +288,8 @@ def biased(study: Study, rows: Sequence[Row]) -> list[str]:
             if (row.scene, row.method, row.time) == (scene, method, study.times[-1])
         ]
         error = sum(last) / len(last)
-        base = floors.get((scene, BASELINE), Estimate(0.0, 0.0))
-        if method == BASELINE:
+        base = floors.get((scene, BASELINE))
+        if method == BASELINE or base is None:
             base = Estimate(0.0, 0.0)
             if _reference_error(rows, scene) > NOISY_REFERENCE:
                 continue
@@ -315,16 +334,16 @@ def _names(chosen: str) -> str:
     return ", ".join(dict.fromkeys(re.sub(r" *\([^)]*\)", "", part) for part in chosen.split("/")))
 
 
-def _choice_lines(picked: Sequence[Choice]) -> list[str]:
+def _choice_lines(picked: Sequence[Choice], unit: str) -> list[str]:
     if not picked:
         return []
     close = sum(choice.close for choice in picked)
     told = [
         f"auto is within {100 * (CLOSE - 1):.0f} % of the best candidate in hindsight, beyond two standard errors, in "
-        f"{close} of {len(picked)} cases of scene and time."
+        f"{close} of {len(picked)} cases of scene and budget."
     ]
     told += [
-        f"not so: {scene_title(c.scene)} at {c.time:g} s, {with_error(c.over)} times the error of {c.best}"
+        f"not so: {scene_title(c.scene)} at {c.time:g} {unit}, {with_error(c.over)} times the error of {c.best}"
         for c in picked
         if not c.close
     ]
@@ -373,7 +392,7 @@ def _budgets(rows: Sequence[Row]) -> list[str]:
         named = methods.setdefault(row.budget, [])
         if row.method not in named:
             named.append(row.method)
-    return [f"time of {', '.join(names)}: {budget}" for budget, names in methods.items()]
+    return [f"budget of {', '.join(names)}: {budget}" for budget, names in methods.items()]
 
 
 def rich_table(sheet: Sheet) -> Table:

@@ -20,7 +20,10 @@ from typing import Any
 
 from ..files import first_line, write_beside
 
-__all__ = ["Row", "Store", "commit", "configuration", "processor"]
+__all__ = ["ALL", "BOUNCES", "Row", "Store", "commit", "configuration", "processor"]
+
+BOUNCES, ALL = "k bounces", "all"
+"""What a truth, and a method, holds: light of exactly k bounces, or all light. The two are never compared."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,13 +36,17 @@ class Row:
     method: str
     seed: int
     time: float
-    """Budget in seconds; `budget` says what is inside."""
+    """Budget in seconds, or samples per pixel; `budget` says what is inside."""
+    unit: str
+    """Of the budget: `s` or `spp`."""
+    light: str
+    """What was rendered: light of `k bounces`, or `all`."""
     budget: str
     """What the time counts and what it does not, in words."""
     elapsed: float
     """Seconds really used."""
     longest: float
-    """Seconds of the run that this is a part of."""
+    """Budget of the run that this is a part of; by samples, each is a run of its own."""
     chosen: str
     """What drew the last pass."""
     width: int
@@ -84,6 +91,11 @@ class Row:
     mitsuba: str
     processor: str
     when: str
+
+    @property
+    def spent(self) -> float:
+        """What was used of the budget, in its unit."""
+        return self.elapsed if self.unit == "s" else float(self.spp)
 
     @property
     def run(self) -> tuple[str, str, int]:

@@ -91,6 +91,7 @@ def thesis(
     pixels = pixels or MOST_PIXELS
     findings = Findings(folder, seed)
     findings.crescents = crescents(parts, seed)
+    shown = []
     for plan in plans:
         scene = open_scene(plan, pixels)
         for note in scene.notes:

@@ -32,11 +32,11 @@ def crescent_chart(path: Path, value: Mapping[str, Any], prior: str, seed: int) 
         np.array(value[name], np.float64) for name in ("latent", "drawn", "generated")
     )
     colour = np.linalg.norm(drawn - (0.5 if prior == "hypercube" else 0.0), axis=1)
-    figure = new_figure(11.2, 4.6)
+    figure = new_figure(11.2, 3.9)
     panels = (
         ("data", points, along, False),
         ("data → latent", latent, along, True),
-        (f"latent, drawn from the prior ({prior})", drawn, colour, True),
+        ("latent numbers of the prior", drawn, colour, True),
         ("latent → data", generated, colour, False),
     )
     far = max(3.2, float(np.quantile(np.abs(latent[np.isfinite(latent)]), 0.995)) * 1.05)
@@ -54,7 +54,10 @@ def crescent_chart(path: Path, value: Mapping[str, Any], prior: str, seed: int) 
         if is_latent and (prior == "gaussian" or i == 1):
             axes.set(xlim=(-far, far), ylim=(-far, far))
         elif not is_latent:
-            axes.set(xlim=(-0.25, 1.25), ylim=(-0.25, 1.25))
+            # What was generated may lie anywhere.
+            low, high = (float(np.quantile(xy, q)) for q in (0.005, 0.995))
+            limits = (min(-0.25, 1.1 * low), max(1.25, 1.1 * high))
+            axes.set(xlim=limits, ylim=limits)
         axes.set_xlabel("z₁" if is_latent else "u₁", fontsize=9)
         axes.set_ylabel("z₂" if is_latent else "u₂", fontsize=9)
         axes.tick_params(labelsize=7.5)
@@ -68,9 +71,10 @@ def crescent_chart(path: Path, value: Mapping[str, Any], prior: str, seed: int) 
         f"middle. Dashed: {shape}; of data the unit square. {percent(value['lost'])} of the crescent's numbers have "
         f"density 0; {percent(value['outside'])} of what is generated falls outside the unit square."
     )
+    named = "Gaussian" if prior == "gaussian" else prior
     title = (
-        f"A crescent learned by RealNVP with the prior {prior}: {count(CRESCENT_ROWS)} numbers, {CRESCENT_EPOCHS} "
-        f"epochs, {count(value['parameters'])} parameters"
+        f"A crescent learned by RealNVP, prior {named}: {count(CRESCENT_ROWS)} numbers, {CRESCENT_EPOCHS} epochs, "
+        f"{count(value['parameters'])} parameters"
     )
     return finish(figure, path, title, [], caption)
 
@@ -93,17 +97,19 @@ def loss_chart(path: Path, scene: str, fits: Sequence[Mapping[str, Any]]) -> lis
         handles.append(Line2D([], [], label=f"{count(trained)} paths", **look))
     axes.set_xlabel("epochs")
     axes.set_title("by number of paths", fontsize=10)
-    other = figure.add_subplot(1, 2, 2, sharey=None)
     own = sorted((f for f in fits if f["of"] == "parameters"), key=lambda fit: fit["parameters"])
+    panels = [axes]
     look = {"color": "black", "marker": "o", "markersize": 4.5, "linewidth": 1.5}
     x = [fit["parameters"] for fit in own]
-    other.plot(x, [fit["held_out"] for fit in own], linestyle="-", **look)
-    other.plot(x, [fit["training"] for fit in own], linestyle="--", **look)
-    other.set_xlabel("parameters")
     if own:
+        other = figure.add_subplot(1, 2, 2)
+        panels.append(other)
+        other.plot(x, [fit["held_out"] for fit in own], linestyle="-", **look)
+        other.plot(x, [fit["training"] for fit in own], linestyle="--", **look)
+        other.set_xlabel("parameters")
         about = f"{count(own[0]['trained_on'])} paths, {own[0]['epochs']} epochs"
         other.set_title(f"by number of parameters ({about})", fontsize=10)
-    for each in (axes, other):
+    for each in panels:
         each.set_xscale("log")
         plain_ticks(each.xaxis)
         each.axhline(0.0, color=MUTED, linewidth=1, linestyle=":")
@@ -111,8 +117,8 @@ def loss_chart(path: Path, scene: str, fits: Sequence[Mapping[str, Any]]) -> lis
         each.set_axisbelow(True)
         each.tick_params(labelsize=8, which="both")
     axes.set_ylabel("mean −ln q (nats)")
-    for label, line in (("held-out paths", "-"), ("training paths", "--")):
-        handles.append(Line2D([], [], color="black", linestyle=line, label=label))
+    handles.append(Line2D([], [], color="black", linestyle="-", label="held-out paths"))
+    handles.append(Line2D([], [], color="black", linestyle="--", label="training paths"))
     handles.append(Line2D([], [], color=MUTED, linestyle=":", label="loss of uniform numbers, 0"))
     caption = (
         "Both losses over paths in proportion to their largest component, as the thesis draws its training set. Where "
@@ -148,6 +154,7 @@ def experiment_chart(
                 textcoords="offset points",
                 va="center",
                 fontsize=8,
+                bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.8},
             )
         axes.axvline(1.0, color="black", linewidth=1)
         largest = max([f.ratio for f in own if np.isfinite(f.ratio)] or [1.0])
@@ -231,7 +238,7 @@ def render_picture(path: Path, runs: ThesisRuns) -> Path:
             _panel(f"{parametrisation}: {run.kind.title}", run.image, run.stats, runs.truth)
             for run in own.values()
         ]
-        rows.append(Row(panels))
+        rows.append(Row(panels, note=_note(runs, parametrisation)))
     heading = (
         f"{scene_title(runs.name)}, light of exactly 2 bounces, {runs.scene.width}×{runs.scene.height}: random and "
         "learned numbers"
@@ -239,6 +246,21 @@ def render_picture(path: Path, runs: ThesisRuns) -> Path:
     caption = f"reference: {runs.truth.note}"
     Picture(heading, rows, reference_panel(runs.truth), caption).draw(path)
     return path
+
+
+def _note(runs: ThesisRuns, parametrisation: str) -> str:
+    """The thesis' measure in words, beside a row."""
+    theirs = {} if runs.thesis is None else runs.thesis.per_ray
+    lines = [
+        parametrisation,
+        "",
+        "non-zero paths per camera ray,",
+        "learned ÷ random:",
+        f"  here {runs.ratio(parametrisation):.2f}",
+    ]
+    return "\n".join(
+        lines + [f"  thesis {theirs[p]:.1f}" for p in [parametrisation] if p in theirs]
+    )
 
 
 def _panel(title: str, image: Path, stats: Mapping[str, Any], truth: Reference) -> Panel:

@@ -1,4 +1,4 @@
-"""What `pssflow study thesis` writes and prints: the thesis' tables with ours beside them, findings, files, the page."""
+"""What `pssflow study thesis` writes and prints: the thesis' tables beside ours, findings, files, the page."""
 
 from __future__ import annotations
 
@@ -33,12 +33,13 @@ __all__ = ["Findings", "publish"]
 NOTES = f"""\
 Preset `thesis`: next-event estimation alone; 16 spp of random numbers teach and are discarded, 16 spp are drawn from
 the flow alone. Nothing guards these (a = 0): where the flow puts no samples, light is missing. Camera rays: here pixels
-× spp; the thesis' {count(CAMERA_RAYS)} are 260² × 16, since PBRT samples the filter's border, too. Found: paths whose two
-vertices exist; a learned sample outside the cube is a camera ray, but no path found. Share: non-zero ÷ found. Per ray:
-non-zero ÷ camera rays, learned ÷ random. What exactly the thesis counts as found is not known here: compare how a share
-changes, not its level. s: pilot, training, rendering. relMSE: against Mitsuba's reference, relative to the square of
-the reference about each pixel, the reference's own variance subtracted; the thesis has no such number. “trimmed” leaves
-out the worst 0.1 % of the pixels. Its network has {count(PARAMETERS)} parameters, as it says; its description gives ours."""
+× spp; the thesis' {count(CAMERA_RAYS)} are 260² × 16, since PBRT samples the filter's border, too. Found: paths whose
+two vertices exist; a learned sample outside the cube is a camera ray, but no path found. Share: non-zero ÷ found. Per
+ray: non-zero ÷ camera rays, learned ÷ random. What exactly the thesis counts as found is not known here: compare how a
+share changes, not its level. s: pilot, training, rendering. relMSE: against Mitsuba's reference, relative to the square
+of the reference about each pixel, the reference's own variance subtracted; the thesis has no such number. “trimmed”
+leaves out the worst 0.1 % of the pixels. The thesis says that its network has {count(PARAMETERS)} parameters; what it
+describes has the number in Table 1."""
 
 
 @dataclass
@@ -371,8 +372,8 @@ def _overfit(findings: Findings) -> list[str]:
 def _prior(findings: Findings) -> list[str]:
     lost = findings.crescents["hypercube"]["lost"]
     text = (
-        f"hypercube prior: after training {percent(lost)} of the crescent's own numbers have density 0. A path that the "
-        "flow maps outside the hypercube has likelihood 0 and no gradient; the others are told to spread, which "
+        f"hypercube prior: after training {percent(lost)} of the crescent's own numbers have density 0. A path that "
+        "the flow maps outside the hypercube has likelihood 0 and no gradient; the others are told to spread, which "
         "maximum likelihood rewards until they have left it, too. A Gaussian has a gradient everywhere"
     )
     return [text]

@@ -53,7 +53,7 @@ KINDS = (
     Kind("random-time", "random, same time", "none"),
     Kind(
         "auto",
-        "auto, same spp with its pilot",
+        "auto, equal spp",
         "auto",
         # Its share of random numbers is its own choice, which the preset would fix.
         {"spp": 32, "preset": None, "emitter_strategy": "nee"},
@@ -177,7 +177,7 @@ def render_runs(
             image = folder / "images" / f"{file_name(plan.name)}-{parametrisation}-{kind.name}.exr"
             arguments: dict[str, Any] = {"preset": "thesis", **kind.arguments}
             if kind.name == "random-time":
-                arguments |= {"time": seconds}
+                arguments |= {"time": float(f"{seconds:.3g}")}
 
             def render(
                 kind: Kind = kind,

@@ -62,6 +62,12 @@ EXPERIMENTS = (
     Experiment("no resampling", "resampling by radiance favours bright paths", alike=True),
     Experiment("through a logit", "samples that fall outside the cube", guide="realnvp-logit"),
     Experiment(
+        "through a logit, 4 × the pilot",
+        "both of them",
+        guide="realnvp-logit",
+        pilot_spp=4 * SPP,
+    ),
+    Experiment(
         "logit, knows the pixel",
         "one density for all pixels (Zheng and Zwicker's know theirs)",
         guide="realnvp-logit",
