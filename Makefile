@@ -95,6 +95,24 @@ study-guides: build ## what each guide gains, costs and comes to at equal time: 
 study-speed-accuracy: build $(VENV)/.studies ## error against wall time, Mitsuba and others beside the guides: an hour, out/study-speed-accuracy; resumes
 	$(BIN)/python -m pssflow study speed-accuracy -o out/study-speed-accuracy
 
+.PHONY: study-thesis
+study-thesis: build ## the source thesis' tables and figures beside ours, what it left open: out/study-thesis; resumes
+	$(BIN)/python -m pssflow study thesis -o out/study-thesis
+
+.PHONY: study-capacity
+study-capacity: build ## error and predicted gain against the size of the model, at equal time: out/study-capacity; resumes
+	$(BIN)/python -m pssflow study capacity scenes/door-ajar -o out/study-capacity
+
+# Our own scenes. 8 scenes × 4 methods × 3 seeds × 30 s are 48 minutes, and the references; more methods take longer.
+RESULTS_SCENES ?= $(sort $(patsubst %/scene.xml,%,$(wildcard scenes/*/scene.xml)))
+RESULTS_GUIDES ?= none,realnvp,table,auto
+RESULTS_OPTIONS ?= --times 10,30 --seeds 3
+
+.PHONY: results
+results: build $(VENV)/.studies ## docs/results.md and its CSV from a study of our own scenes: an hour, out/results; resumes
+	$(BIN)/python -m pssflow study guides $(RESULTS_SCENES) --guides $(RESULTS_GUIDES) $(RESULTS_OPTIONS) -o out/results
+	$(BIN)/python -m pssflow study results out/results -o docs/results.md
+
 .PHONY: docs
 docs: build $(VENV)/.docs ## Rust API into target/doc, Python API into out/docs
 	RUSTDOCFLAGS="-D warnings" cargo doc --workspace --no-deps

@@ -76,6 +76,7 @@ def error_chart(
             label if i % columns == 0 else "",
             i >= len(scenes) - columns,
             rows[0].unit,
+            sorted({row.time for row in rows}),
         )
     handles = _legend_handles(methods, known)
     from matplotlib.lines import Line2D
@@ -208,8 +209,12 @@ def _guides(axes: Any, rows: Sequence[Row], measure: str) -> None:
             axes.set_ylim(low, high)
 
 
-def _scene_axes(axes: Any, title: str, label: str, last: bool, unit: str) -> None:
+def _scene_axes(
+    axes: Any, title: str, label: str, last: bool, unit: str, budgets: Sequence[float]
+) -> None:
     plain_ticks(axes.xaxis)
+    # Between a few budgets there is nothing to read.
+    axes.set_xticks(budgets, [f"{budget:g}" for budget in budgets])
     axes.set_title(title, fontsize=10)
     axes.set_ylabel(label)
     if last:

@@ -297,27 +297,36 @@ class Study:
         return reference_path(self.folder, scene)
 
     def floors(self) -> dict[tuple[str, str], metrics.Estimate]:
-        """The squared bias that the last images of several seeds have in common, by scene and method."""
-        found: dict[tuple[str, str], metrics.Estimate] = {}
-        if len(self.seeds) < 2:
-            return found
-        done = {row.run for row in self.rows if row.time == self.times[-1] and row.spp}
-        for scenery in self.sceneries:
-            truth = None
-            for method in self.methods:
-                runs = [(scenery.name, method.name, seed) for seed in self.seeds]
-                if any(run not in done for run in runs):
-                    continue
-                paths = [image_path(self.folder, *run, self.times[-1], self.unit) for run in runs]
-                reference = reference_path(self.folder, scenery.name)
-                if not all(path.is_file() for path in (*paths, reference)):
-                    continue
-                truth = truth or read_exr(reference)
-                images = [read_exr(path).image for path in paths]
-                found[scenery.name, method.name] = metrics.floor(
-                    images, truth.image, truth.variance, scale=metrics.local_scale(truth.image)
-                )
+        """See `floors`; of this study's rows."""
+        return floors(self.folder, self.rows, len(self.seeds))
+
+
+def floors(
+    folder: Path, rows: Sequence[Row], seeds: int
+) -> dict[tuple[str, str], metrics.Estimate]:
+    """The squared bias that the last images of several seeds have in common, by scene and method.
+
+    Only where all of so many seeds have their image of the longest budget.
+    """
+    found: dict[tuple[str, str], metrics.Estimate] = {}
+    if seeds < 2:
         return found
+    last = [row for row in rows if row.spp and row.time == row.longest]
+    truths: dict[str, Reference] = {}
+    for scene, method in dict.fromkeys((row.scene, row.method) for row in last):
+        own = [row for row in last if (row.scene, row.method) == (scene, method)]
+        paths = [image_path(folder, scene, method, row.seed, row.time, row.unit) for row in own]
+        place = reference_path(folder, scene)
+        if len(own) < seeds or not all(path.is_file() for path in (*paths, place)):
+            continue
+        if scene not in truths:
+            truths = {scene: read_exr(place)}  # scene after scene: one is held at a time
+        truth = truths[scene]
+        images = [read_exr(path).image for path in paths]
+        found[scene, method] = metrics.floor(
+            images, truth.image, truth.variance, scale=metrics.local_scale(truth.image)
+        )
+    return found
 
 
 def measured(shot: Shot, truth: Reference, common: Mapping[str, Any]) -> Row:

@@ -21,6 +21,10 @@ STUDIES = {
         "speed_accuracy",
         "Error against wall time: guides, Mitsuba and others, with charts and an image viewer.",
     ),
+    "results": (
+        "results",
+        "docs/results.md from a finished study: wins and losses of every method, and how it was measured.",
+    ),
 }
 """Name → the module in this package that defines a command of that name, and what it shows."""
 

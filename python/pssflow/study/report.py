@@ -23,7 +23,23 @@ from .page import Chart, study_scenes, write_page
 from .store import ALL, Row
 from .summary import BASELINE, CLOSE, Cell, Choice, Overall, cells, choices, overall, reaches
 
-__all__ = ["Sheet", "biased", "machine_lines", "publish", "rich_table", "write_summary"]
+__all__ = [
+    "NOTES",
+    "Sheet",
+    "bias_lines",
+    "biased",
+    "budgets",
+    "choice_lines",
+    "errors_sheet",
+    "machine_lines",
+    "noisy_references",
+    "publish",
+    "rich_table",
+    "sums_sheet",
+    "too_early",
+    "with_error",
+    "write_summary",
+]
 
 NOTES = """\
 relMSE, and the variance that an image says of itself, are relative to the square of the reference about each pixel, in
@@ -33,8 +49,8 @@ errors too large and all ratios too near 1. Of relMSE the reference's own varian
 reference's noise. variance × budget: the image's own, in seconds or samples. Time (samples) to an error: where the line
 of means over seeds crosses it on logarithmic axes, never beyond what was measured. Ratios are those of random sampling
 (none) ÷ the method: above 1 is a gain; but cost is the method's ÷ random's. gain / path: the images' own variance;
-equal samples and equal time: relMSE; cost: seconds a path with pilot and training inside. ± is one standard error over seeds;
-win and loss are beyond two, at equal time or, where the budget is samples, at equal samples. A time shorter than the
+equal samples and equal time: relMSE; cost: seconds a path with pilot and training inside. ± is one standard error over
+seeds; win and loss are beyond two, at equal time or, where the budget is samples, at equal samples. A time shorter than the
 run is a snapshot of it: its pilot was planned for the whole. “All light” is Mitsuba's path against its own reference:
 it renders something else than the others, and is compared with none of them."""
 
@@ -79,18 +95,18 @@ def publish(study: Study, rows: Sequence[Row], title: str) -> list[Any]:
     total = overall(found)
     picked = choices(found, competitors=OTHERS) if "auto" in methods else []
     sheets = [
-        *([_sums(total, study.unit)] if total else []),
-        _errors(found),
+        *([sums_sheet(total, study.unit)] if total else []),
+        errors_sheet(found),
         *([_ratios(found)] if total else []),
-        *([sheet] if (sheet := _times_to_errors(found, study.unit)).rows else []),
+        *([sheet] if (sheet := _times_toerrors_sheet(found, study.unit)).rows else []),
     ]
     lines = [
         *biased(study, rows),
-        *_choice_lines(picked, study.unit),
-        *_too_early(early),
-        *_noisy_references(rows),
+        *choice_lines(picked, study.unit),
+        *too_early(early),
+        *noisy_references(rows),
         *_failures(study),
-        *_budgets(rows),
+        *budgets(rows),
         *([] if has_flip() else ["FLIP is not measured: the package flip-evaluator is missing"]),
         *machine_lines([vars(row) for row in rows or early], rows[0].processor, rows[0].mitsuba),
     ]
@@ -126,7 +142,8 @@ def write_summary(path: Path, heading: str, sheets: Sequence[Sheet], lines: Sequ
     write_beside(path, lambda part: part.write_text(text + "\n", encoding="utf-8"))
 
 
-def _errors(found: Sequence[Cell]) -> Sheet:
+def errors_sheet(found: Sequence[Cell]) -> Sheet:
+    """Errors by scene, method and budget."""
     headings = (
         *("scene", "method", "budget", "spp", "relMSE", "trimmed", "MAPE", "FLIP", "non-zero"),
         *("own variance", "variance × budget"),
@@ -172,7 +189,7 @@ def _ratios(found: Sequence[Cell]) -> Sheet:
     return Sheet("Ratios to random sampling", headings, table)
 
 
-def _times_to_errors(found: Sequence[Cell], unit: str) -> Sheet:
+def _times_toerrors_sheet(found: Sequence[Cell], unit: str) -> Sheet:
     """A row for each scene and error, a column for each method."""
     known = reaches(found)
     methods = list(dict.fromkeys(reach.method for reach in known))
@@ -195,7 +212,8 @@ def _times_to_errors(found: Sequence[Cell], unit: str) -> Sheet:
     return Sheet(what, ("scene", "relMSE", *methods), table, texts=1)
 
 
-def _sums(total: Sequence[Overall], unit: str) -> Sheet:
+def sums_sheet(total: Sequence[Overall], unit: str) -> Sheet:
+    """A line for each method and budget, over all scenes."""
     equal = "equal time" if unit == "s" else "equal samples"
     headings = (
         *("method", "budget", "scenes", f"{equal}, geometric mean", "gain / path"),
@@ -274,18 +292,22 @@ NOISY_REFERENCE = 0.1
 
 
 def biased(study: Study, rows: Sequence[Row]) -> list[str]:
+    """`bias_lines` of a study."""
+    return bias_lines(study.floors(), rows)
+
+
+def bias_lines(floors: Mapping[tuple[str, str], Estimate], rows: Sequence[Row]) -> list[str]:
     """A line for each method whose seeds err in common: what no time takes away.
 
     A noisy reference makes all methods err in common, so that it is what random sampling has not that counts, if that
     was measured. Told beyond four standard errors (dozens are tested), and where it makes a twentieth of the relMSE.
     """
     lines = []
-    floors = study.floors()
     for (scene, method), floor in floors.items():
         last = [
             row.relmse
             for row in rows
-            if (row.scene, row.method, row.time) == (scene, method, study.times[-1])
+            if (row.scene, row.method) == (scene, method) and row.time == row.longest
         ]
         error = sum(last) / len(last)
         base = floors.get((scene, BASELINE))
@@ -306,7 +328,8 @@ def _reference_error(rows: Sequence[Row], scene: str) -> float:
     return math.sqrt(max(row.reference_variance for row in rows if row.scene == scene))
 
 
-def _noisy_references(rows: Sequence[Row]) -> list[str]:
+def noisy_references(rows: Sequence[Row]) -> list[str]:
+    """A line for each reference whose noise is to be known."""
     lines = []
     for scene in dict.fromkeys(row.scene for row in rows):
         error = _reference_error(rows, scene)
@@ -334,7 +357,8 @@ def _names(chosen: str) -> str:
     return ", ".join(dict.fromkeys(re.sub(r" *\([^)]*\)", "", part) for part in chosen.split("/")))
 
 
-def _choice_lines(picked: Sequence[Choice], unit: str) -> list[str]:
+def choice_lines(picked: Sequence[Choice], unit: str) -> list[str]:
+    """How often `auto` came near the best, and where it did not."""
     if not picked:
         return []
     close = sum(choice.close for choice in picked)
@@ -374,7 +398,7 @@ def machine_lines(
     return lines
 
 
-def _too_early(early: Sequence[Row]) -> list[str]:
+def too_early(early: Sequence[Row]) -> list[str]:
     """Times at which a method had no image yet."""
     times: dict[tuple[str, str], set[float]] = {}
     for row in early:
@@ -385,7 +409,7 @@ def _too_early(early: Sequence[Row]) -> list[str]:
     ]
 
 
-def _budgets(rows: Sequence[Row]) -> list[str]:
+def budgets(rows: Sequence[Row]) -> list[str]:
     """What each method's time counts."""
     methods: dict[str, list[str]] = {}
     for row in rows:

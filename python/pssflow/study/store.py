@@ -20,7 +20,7 @@ from typing import Any
 
 from ..files import first_line, write_beside
 
-__all__ = ["ALL", "BOUNCES", "Row", "Store", "commit", "configuration", "processor"]
+__all__ = ["ALL", "BOUNCES", "Row", "Store", "commit", "configuration", "processor", "write_rows"]
 
 BOUNCES, ALL = "k bounces", "all"
 """What a truth, and a method, holds: light of exactly k bounces, or all light. The two are never compared."""
@@ -159,15 +159,24 @@ class Store:
         new = list(rows)
         runs = {row.run for row in new}
         self.rows = [row for row in self.rows if row.run not in runs] + new
+        write_rows(self.path, self.rows)
 
-        def write(part: Path) -> None:
-            with part.open("w", newline="", encoding="utf-8") as file:
-                names = [item.name for item in dataclasses.fields(Row)]
-                writer = csv.DictWriter(file, names, lineterminator="\n")
-                writer.writeheader()
-                writer.writerows(dataclasses.asdict(row) for row in self.rows)
 
-        write_beside(self.path, write)
+def write_rows(path: Path, rows: Iterable[Row]) -> None:
+    """Rows as a CSV that `Store` reads.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+
+    def write(part: Path) -> None:
+        with part.open("w", newline="", encoding="utf-8") as file:
+            names = [item.name for item in dataclasses.fields(Row)]
+            writer = csv.DictWriter(file, names, lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(dataclasses.asdict(row) for row in rows)
+
+    write_beside(path, write)
 
 
 def configuration(**what: Any) -> str:
