@@ -65,6 +65,10 @@ class Shot:
     spp: int
     chosen: str = ""
     nonzero_share: float | None = None
+    parameters: int | None = None
+    """Weights that were learned."""
+    predicted_gain: float | None = None
+    """Variance per path, random ÷ the method's, as held-out paths foretell it; where it was asked for."""
     seconds: Mapping[str, float] = field(default_factory=dict)
     """By phase: `pilot`, `fit`, `render`; `warm_up` is outside of the time."""
 
@@ -356,6 +360,8 @@ def measured(shot: Shot, truth: Reference, common: Mapping[str, Any]) -> Row:
         paths=shot.spp * width * height,
         **phases,
         nonzero_share=shot.nonzero_share,
+        parameters=shot.parameters,
+        predicted_gain=shot.predicted_gain,
         relmse=error.value,
         relmse_error=error.error,
         relmse_trimmed=metrics.relmse_trimmed(*against, scale=scale),
@@ -384,6 +390,8 @@ def nothing_yet(
         paths=0,
         **phases,
         nonzero_share=None,
+        parameters=None,
+        predicted_gain=None,
         relmse=math.nan,
         relmse_error=math.nan,
         relmse_trimmed=math.nan,

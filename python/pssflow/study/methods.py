@@ -20,7 +20,7 @@ import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -133,6 +133,7 @@ def guided(
     threads: int | None,
     options: Mapping[str, Any],
     unit: str = "s",
+    predict: Callable[[Scene, Result], float | None] = lambda scene, result: None,
     **guide_options: Any,
 ) -> Method:
     """A guide, made anew for each run: one render with snapshots by time, one for each budget by samples.
@@ -144,6 +145,7 @@ def guided(
         threads: None for all cores.
         options: for the record.
         unit: `s` or `spp`.
+        predict: asked for the gain after the time is over.
         **guide_options: the guide's own.
     """
 
@@ -151,12 +153,12 @@ def guided(
         common: dict[str, Any] = {"k": k, "threads": threads, "seed": seed, "progress": progress}
         common |= guide_options
         if unit == "spp":
-            return [
-                shot_of(stage.scene.render(guide(), spp=int(spp), **common), spp) for spp in times
-            ]
-        whole = stage.scene.render(guide(), time=times[-1], snapshots=times[:-1], **common)
-        parts = (*whole.snapshots, whole)
-        return [shot_of(part, seconds) for part, seconds in zip(parts, times, strict=True)]
+            parts = tuple(stage.scene.render(guide(), spp=int(spp), **common) for spp in times)
+        else:
+            whole = stage.scene.render(guide(), time=times[-1], snapshots=times[:-1], **common)
+            parts = (*whole.snapshots, whole)
+        shots = [shot_of(part, budget) for part, budget in zip(parts, times, strict=True)]
+        return [*shots[:-1], replace(shots[-1], predicted_gain=predict(stage.scene, parts[-1]))]
 
     inside = "rendering" if name == "none" else "pilot, training, selection and rendering"
     budget = f"{inside} inside; loading and BVH outside"
@@ -178,6 +180,7 @@ def shot_of(result: Result, budget: float) -> Shot:
         spp=sum(part["spp"] for part in stats["passes"]),
         chosen=stats["chosen"],
         nonzero_share=drawn,
+        parameters=((stats["training"] or {}).get("guide") or {}).get("parameters"),
         seconds={phase: stats["seconds"][phase] for phase in ("pilot", "fit", "render")},
     )
 

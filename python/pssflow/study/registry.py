@@ -21,6 +21,10 @@ STUDIES = {
         "speed_accuracy",
         "Error against wall time: guides, Mitsuba and others, with charts and an image viewer.",
     ),
+    "capacity": (
+        "capacity",
+        "Error and predicted gain against the size of the model at equal time: how small is enough.",
+    ),
     "results": (
         "results",
         "docs/results.md from a finished study: wins and losses of every method, and how it was measured.",

@@ -42,17 +42,18 @@ __all__ = [
 ]
 
 NOTES = """\
-relMSE, and the variance that an image says of itself, are relative to the square of the reference about each pixel, in
-the mean of its 24 neighbours: by its own square, as is usual (relmse_pixel in results.csv), a noisy reference makes all
-errors too large and all ratios too near 1. Of relMSE the reference's own variance is subtracted, * lies below it.
-“trimmed” leaves out the worst 0.1 % of pixels, which hides fireflies. MAPE and FLIP (HDR-FLIP's mean, 0 … 1) hold the
-reference's noise. variance × budget: the image's own, in seconds or samples. Time (samples) to an error: where the line
-of means over seeds crosses it on logarithmic axes, never beyond what was measured. Ratios are those of random sampling
-(none) ÷ the method: above 1 is a gain; but cost is the method's ÷ random's. gain / path: the images' own variance;
-equal samples and equal time: relMSE; cost: seconds a path with pilot and training inside. ± is one standard error over
-seeds; win and loss are beyond two, at equal time or, where the budget is samples, at equal samples. A time shorter than the
-run is a snapshot of it: its pilot was planned for the whole. “All light” is Mitsuba's path against its own reference:
-it renders something else than the others, and is compared with none of them."""
+relMSE, and the variance that an image says of itself, are relative to the square of the reference about each pixel,
+in the mean of its 24 neighbours: by its own square, as is usual (relmse_pixel in results.csv), a noisy reference
+makes all errors too large and all ratios too near 1. Of relMSE the reference's own variance is subtracted, * lies
+below it. “trimmed” leaves out the worst 0.1 % of pixels, which hides fireflies. MAPE and FLIP (HDR-FLIP's mean, 0 …
+1) hold the reference's noise. variance × budget: the image's own, in seconds or samples. Time (samples) to an error:
+where the line of means over seeds crosses it on logarithmic axes, never beyond what was measured. Ratios are those of
+random sampling (none) ÷ the method: above 1 is a gain; but cost is the method's ÷ random's. gain / path: the images'
+own variance; equal samples and equal time: relMSE; cost: seconds a path with pilot and training inside. ± is one
+standard error over seeds; win and loss are beyond two, at equal time or, where the budget is samples, at equal
+samples. A time shorter than the run is a snapshot of it: its pilot was planned for the whole. “All light” is
+Mitsuba's path against its own reference: it renders something else than the others, and is compared with none of
+them."""
 
 MEASURES = {
     "relmse": ("error", "Error against time", "relMSE"),

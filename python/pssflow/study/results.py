@@ -119,8 +119,8 @@ def document(rows: Sequence[Row], folder: Path, table: str) -> str:
                 f"## Random sampling ÷ the method at {time:g} {unit}",
                 "Of relMSE against the reference:",
                 _matrix(found, total, time),
-                "Of the variance that the images say of themselves, which no reference has a part in, and which knows "
-                "nothing of fireflies that did not come:",
+                "Of the variance that the images say of themselves, to which the reference gives its scale alone, and "
+                "which knows nothing of fireflies that did not come:",
                 _own_matrix(found, time),
             )
         ),

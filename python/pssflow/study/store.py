@@ -63,6 +63,10 @@ class Row:
     """Outside of the time: compiling, where the method does."""
     nonzero_share: float | None
     """Paths that carry light, of those found."""
+    parameters: int | None
+    """Weights that the method learned."""
+    predicted_gain: float | None
+    """Variance per path, random ÷ the method's, foretold by held-out paths."""
     relmse: float
     relmse_error: float
     """Standard error from the spread between pixels."""
