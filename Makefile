@@ -65,7 +65,7 @@ test: build ## the quick tier: Rust, Python, and whether as many tests ran as sh
 	$(BIN)/python tests/check_count.py rust-quick=$(REPORTS)/rust.log python-quick=$(REPORTS)/python
 
 .PHONY: test-long
-test-long: build ## every test, the long ones too
+test-long: build $(VENV)/.browser ## every test, the long ones too
 	@mkdir -p $(REPORTS)
 	$(RUST_TEST) -- --include-ignored 2>&1 | tee $(REPORTS)/rust.log
 	$(call PYTEST)
@@ -135,6 +135,11 @@ $(VENV)/.ready: .ci/system
 # Builds the extension and installs it (editable) with what it needs to run and to be tested.
 $(VENV)/.built: $(VENV)/.ready $(SOURCES) $(if $(EXTENSION),,missing-extension)
 	$(BIN)/maturin develop --release --extras test
+	touch $@
+
+# Chromium, for the test of report.html in a browser, where apt may install it; without it that test is skipped.
+$(VENV)/.browser: .ci/system | $(VENV)/.built
+	PYTHON="$(PYTHON)" .ci/system browser
 	touch $@
 
 .PHONY: missing-extension

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from ..metrics import Estimate, mean_and_error
 from ..report import count, number, scene_title
@@ -131,7 +132,7 @@ def _smallest(own: Sequence[Model], best: Model) -> str:
 
 def _named(model: Model) -> str:
     if model.family is None:
-        return "no model at all"
+        return "random numbers (no parameters)"
     return f"{model.cell.method} ({count(round(model.parameters))} parameters)"
 
 
@@ -215,11 +216,18 @@ def capacity_chart(
         handles.append(
             Line2D([], [], color=MUTED, linestyle="--", label="the reference’s own variance")
         )
-    for line, label in (("-", "measured gain / path"), ("--", "predicted on held-out paths")):
-        fill = "white" if line == "--" else MUTED
-        shown = Line2D([], [], color=MUTED, marker="o", markerfacecolor=fill, label=label)
-        shown.set_linestyle(line)
-        handles.append(shown)
+    look: dict[str, Any] = {"color": MUTED, "marker": "o"}
+    handles += [
+        Line2D([], [], linestyle="-", label="measured gain / path", **look),
+        Line2D(
+            [],
+            [],
+            linestyle="--",
+            markerfacecolor="white",
+            label="predicted on held-out paths",
+            **look,
+        ),
+    ]
     equal = "equal time" if about.unit == "s" else "equal samples"
     left.set_ylabel("relMSE")
     left.set_title(f"error at {equal} (numbers: the option's value)", fontsize=10)

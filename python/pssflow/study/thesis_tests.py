@@ -11,7 +11,7 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ import numpy as np
 from ..scene import Scene
 from .parity import Plan
 from .parts import Parts
-from .thesis_flow import held_out, learn_crescent, training_paths
+from .thesis_flow import Paths, held_out, learn_crescent, training_paths
 from .thesis_scene import open_scene
 
 __all__ = ["EXPERIMENTS", "Experiment", "Found", "experiments", "overfitting", "side_by_side"]
@@ -237,15 +237,24 @@ def overfitting(
 
     A fit over e epochs is the beginning of one over more: order and steps depend on the seed alone.
     """
-    source = training_paths(scene, parametrisation, spp=SPP, seed=seed)
-    others = training_paths(scene, parametrisation, spp=4, seed=seed + 1)
+
+    @cache
+    def drawn() -> tuple[Paths, Paths]:
+        """To learn from, and held out."""
+        return (
+            training_paths(scene, parametrisation, spp=SPP, seed=seed),
+            training_paths(scene, parametrisation, spp=4, seed=seed + 1),
+        )
+
+    common = {"scene": scene.hash, "seed": seed, "on": parametrisation}
+    lit = parts(f"{scene.name} paths with light", lambda: {"paths": len(drawn()[0].u)}, **common)
     fits = [{"of": of, "hidden": 40, **fit} for of, list_ in LEARNING.items() for fit in list_]
     # A scene of few paths has fewer to learn from than the largest set asks for.
-    fits = [fit for fit in fits if fit["rows"] <= max(len(source.u), 1024)]
+    fits = [fit for fit in fits if fit["rows"] <= max(lit["paths"], 1024)]
 
     def work(fit: dict[str, Any], stop: threading.Event) -> dict[str, Any]:
         def make() -> dict[str, Any]:
-            own = source.take(fit["rows"])
+            own, others = drawn()[0].take(fit["rows"]), drawn()[1]
             guide = own.fit(
                 "realnvp",
                 epochs=fit["epochs"],
@@ -260,8 +269,8 @@ def overfitting(
                 "held_out": held_out(guide, others),
             }
 
-        name = f"{scene.name} loss {fit['rows']} paths {fit['epochs']} epochs {fit['hidden']} units"
-        value = parts(name, make, scene=scene.hash, seed=seed, fit=fit, on=parametrisation)
+        name = f"{scene.name} loss by {fit['of']}, {fit['rows']} paths {fit['epochs']} epochs {fit['hidden']} units"
+        value = parts(name, make, fit=fit, **common)
         return fit | value
 
     return side_by_side(work, fits)
