@@ -65,7 +65,7 @@ test: build ## the quick tier: Rust, Python, and whether as many tests ran as sh
 	$(BIN)/python tests/check_count.py rust-quick=$(REPORTS)/rust.log python-quick=$(REPORTS)/python
 
 .PHONY: test-long
-test-long: build ## every test, the long ones too
+test-long: build $(VENV)/.browser ## every test, the long ones too
 	@mkdir -p $(REPORTS)
 	$(RUST_TEST) -- --include-ignored 2>&1 | tee $(REPORTS)/rust.log
 	$(call PYTEST)
@@ -95,6 +95,24 @@ study-guides: build ## what each guide gains, costs and comes to at equal time: 
 study-speed-accuracy: build $(VENV)/.studies ## error against wall time, Mitsuba and others beside the guides: an hour, out/study-speed-accuracy; resumes
 	$(BIN)/python -m pssflow study speed-accuracy -o out/study-speed-accuracy
 
+.PHONY: study-thesis
+study-thesis: build ## the source thesis' tables and figures beside ours, what it left open: out/study-thesis; resumes
+	$(BIN)/python -m pssflow study thesis -o out/study-thesis
+
+.PHONY: study-capacity
+study-capacity: build ## error and predicted gain against the size of the model, at equal time: out/study-capacity; resumes
+	$(BIN)/python -m pssflow study capacity scenes/door-ajar -o out/study-capacity
+
+# Our own scenes. 8 scenes × 4 methods × 3 seeds × 30 s are 48 minutes, and the references; more methods take longer.
+RESULTS_SCENES ?= $(sort $(patsubst %/scene.xml,%,$(wildcard scenes/*/scene.xml)))
+RESULTS_GUIDES ?= none,realnvp,table,auto
+RESULTS_OPTIONS ?= --times 10,30 --seeds 3
+
+.PHONY: results
+results: build $(VENV)/.studies ## docs/results.md and its CSV from a study of our own scenes: an hour, out/results; resumes
+	$(BIN)/python -m pssflow study guides $(RESULTS_SCENES) --guides $(RESULTS_GUIDES) $(RESULTS_OPTIONS) -o out/results
+	$(BIN)/python -m pssflow study results out/results -o docs/results.md
+
 .PHONY: docs
 docs: build $(VENV)/.docs ## Rust API into target/doc, Python API into out/docs
 	RUSTDOCFLAGS="-D warnings" cargo doc --workspace --no-deps
@@ -117,6 +135,11 @@ $(VENV)/.ready: .ci/system
 # Builds the extension and installs it (editable) with what it needs to run and to be tested.
 $(VENV)/.built: $(VENV)/.ready $(SOURCES) $(if $(EXTENSION),,missing-extension)
 	$(BIN)/maturin develop --release --extras test
+	touch $@
+
+# Chromium, for the test of report.html in a browser, where apt may install it; without it that test is skipped.
+$(VENV)/.browser: .ci/system | $(VENV)/.built
+	PYTHON="$(PYTHON)" .ci/system browser
 	touch $@
 
 .PHONY: missing-extension

@@ -137,7 +137,9 @@ def _images(
     pixels = int(np.prod(np.array(film.crop_size())))
     most = max(MOST_AT_ONCE // pixels, 1)
     emitters = dr.gather(
-        mi.UInt32, mi.UInt32(ours.exported.emitter_order or [0]), dr.arange(mi.UInt32, max(len(ours.exported.emitter_order), 1))
+        mi.UInt32,
+        mi.UInt32(ours.exported.emitter_order or [0]),
+        dr.arange(mi.UInt32, max(len(ours.exported.emitter_order), 1)),
     )
     for k, guide, a, strategy in sources(result):
         for first in range(0, spp, most):
@@ -168,7 +170,7 @@ def _images(
 def radiance(
     scene: Any, sensor: Any, drawn: dict[str, Any], k: int, emitters: Any
 ) -> tuple[Any, Any]:
-    """f ÷ m of drawn paths with its graph, and where on the film they belong.
+    """F ÷ m of drawn paths with its graph, and where on the film they belong.
 
     Args:
         scene: Mitsuba's scene.
@@ -256,5 +258,3 @@ def _has_delta(bsdf: Any) -> bool:
     return bool(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)) or bool(
         mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
     )
-
-

@@ -25,25 +25,21 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
 from . import metrics
 from .export import Export, export
-from .export.sensors import select_sensor
 from .files import first_line, write_beside
 from .options import MAX_BOUNCES, check_integer, check_number
+from .passes import AllLightPass, KBouncePass, TruthPass, is_jit
 from .progress import Progress, reporting
 from .scene import Scene, SceneLike, load_scene
-from .variants import quiet
 
 __all__ = [
-    "KBouncePass",
     "Reference",
     "Running",
-    "TruthPass",
     "cache_path",
     "default_cache",
     "read_exr",
@@ -83,7 +79,7 @@ class Reference:
     note: str
     """Why it ended, or where it comes from; one line."""
     k: int | None = None
-    """Bounces; None if unknown."""
+    """Bounces; None if unknown, or of all light."""
     path: Path | None = None
     """The file that it is kept in."""
     reached: bool = True
@@ -129,6 +125,7 @@ def reference(
     seed0: int = 0,
     progress: Progress = True,
     cache: str | Path | bool | None = None,
+    all_light: bool = False,
 ) -> Reference:
     """Renders Mitsuba's truth for light of exactly k bounces, or adds what is missing to a cached one.
 
@@ -144,6 +141,7 @@ def reference(
         seed0: seed of the first pass.
         progress: as in `pssflow.render`; the phase is "reference".
         cache: a folder; None for `default_cache()`, False for none. Files are named by scene, k, size and crop.
+        all_light: the whole image by `path` of unlimited depth instead, whatever `k` says.
 
     Raises:
         UnsupportedError, FileNotFoundError: as `pssflow.render`.
@@ -172,11 +170,12 @@ def reference(
         approximate=own and scene.approximate,
     )
     hide = bool(exported.description["hide_emitters"])
-    renderer = (
-        KBouncePass(mi_scene, camera, k)
-        if is_jit(mi_scene) and not hide
-        else TruthPass(mi_scene, camera, k, hide=hide)
-    )
+    if all_light:
+        k, renderer = 0, AllLightPass(mi_scene, camera, hide=hide)
+    elif is_jit(mi_scene) and not hide:
+        renderer = KBouncePass(mi_scene, camera, k)
+    else:
+        renderer = TruthPass(mi_scene, camera, k, hide=hide)
     path = _writable_cache(cache, notices, exported, k, seed0, renderer.name)
     total = _load(path, notices) if path is not None else None
     reused = 0 if total is None else total.passes
@@ -208,7 +207,7 @@ def reference(
         spp=total.spp,
         seconds=total.seconds,
         note="; ".join([f"{renderer.name}, {mi_scene.variant_name()}, {ending}{origin}", *notices]),
-        k=k,
+        k=None if all_light else k,
         path=path,
         reached=reached,
     )
@@ -294,96 +293,6 @@ class Running:
     def standard_error(self) -> float:
         """Relative standard error of the mean, as `Reference.standard_error`."""
         return metrics.relative_error(self.variance(), self.mean)
-
-
-def is_jit(scene: Any) -> bool:
-    """Whether an `mi.Scene` belongs to a variant that compiles."""
-    return not scene.variant_name().startswith("scalar")
-
-
-class _Pass:
-    """What both ways to render a pass share: the film, read raw, and the sampler, left as it was."""
-
-    name = ""
-    """For notes and the cache's names."""
-
-    def __init__(self, scene: Any, sensor: Any) -> None:
-        self.scene = scene
-        self.camera = select_sensor(scene, sensor)
-        self.jit = is_jit(scene)
-        self.sample_count = self.camera.sampler().sample_count()
-
-    def __call__(self, seed: int, spp: int) -> tuple[F64, int, int]:
-        """The image (H, W, 3), samples that the sampler made of `spp`, and values that were not finite."""
-        # Its warnings are of Ctrl-C, which is answered elsewhere, and of values that are counted here.
-        with dr.suspend_grad(), quiet():
-            image = self._render(seed, spp)
-        bad = ~np.isfinite(image)
-        image[bad] = 0.0
-        return image, self.camera.sampler().sample_count(), int(np.count_nonzero(bad))
-
-    def _render(self, seed: int, spp: int) -> F64:
-        """The image, with whatever is in it."""
-        raise NotImplementedError
-
-    def restore(self) -> None:
-        """Gives the sampler its own count back: rendering with another one changes it."""
-        self.camera.sampler().set_sample_count(self.sample_count)
-
-    def _image(self, integrator: Any, seed: int, spp: int) -> F64:
-        integrator.render(
-            self.scene, sensor=self.camera, seed=seed, spp=spp, develop=False, evaluate=True
-        )
-        # Raw, R G B (A) W: the same for each pixel format of the film.
-        raw = np.array(self.camera.film().develop(raw=True), np.float64)
-        weight = raw[..., -1:]
-        return raw[..., :3] / np.where(weight == 0.0, 1.0, weight)
-
-
-class TruthPass(_Pass):
-    """One pass of the truth, from a seed of its own: the difference of two path integrators.
-
-    Args:
-        scene: an `mi.Scene`.
-        sensor: index of the sensor, or a sensor object.
-        k: bounces.
-        hide: whether emitters are seen through, as Mitsuba's `hide_emitters`.
-    """
-
-    name = "difference of two Mitsuba path"
-
-    def __init__(self, scene: Any, sensor: Any, k: int, *, hide: bool) -> None:
-        super().__init__(scene, sensor)
-        self.deep, self.shallow = (
-            mi.load_dict(
-                {"type": "path", "max_depth": depth, "rr_depth": k + 2, "hide_emitters": hide}
-            )
-            for depth in (k + 1, k)
-        )
-
-    def _render(self, seed: int, spp: int) -> F64:
-        # A scalar sampler's streams part ways at the last bounce, so that one seed for both would buy nothing.
-        seeds = (seed, seed) if self.jit else (2 * seed, 2 * seed + 1)
-        return self._image(self.deep, seeds[0], spp) - self._image(self.shallow, seeds[1], spp)
-
-
-class KBouncePass(_Pass):
-    """One pass of Mitsuba's path tracer for light of exactly k bounces (`plugins/kbounce.py`).
-
-    Args:
-        scene: an `mi.Scene` of the active variant.
-        sensor: index of the sensor, or a sensor object.
-        k: bounces.
-    """
-
-    name = "Mitsuba path, k bounces only"
-
-    def __init__(self, scene: Any, sensor: Any, k: int) -> None:
-        super().__init__(scene, sensor)
-        self.integrator = mi.load_dict({"type": "pssflow_kbounce", "k": k})
-
-    def _render(self, seed: int, spp: int) -> F64:
-        return self._image(self.integrator, seed, spp)
 
 
 def _more(

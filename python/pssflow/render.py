@@ -182,7 +182,9 @@ def render(
         if isinstance(replay, (str, os.PathLike, Mapping)):
             replay = read_replay(replay)
             if "lengths" in replay:
-                guide, guide_options, replay, max_depth, records = _replayed_light(replay, guide, settings)
+                guide, guide_options, replay, max_depth, records = _replayed_light(
+                    replay, guide, settings
+                )
         elif max_depth is not None:
             raise ValueError("`max_depth` was given, but `replay` holds the passes of one k")
         if isinstance(replay, Mapping):

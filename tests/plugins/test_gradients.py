@@ -134,7 +134,9 @@ def test_what_else_is_refused(llvm_variant):
     hidden: Any = mi.load_dict({"type": "pssflow", "guide": "none", "hide_emitters": True})
     with pytest.raises(RuntimeError):
         dr.backward(dr.sum(_image(scene, params, hidden), axis=None))
-    bold: Any = mi.load_dict({"type": "pssflow", "guide": "realnvp", "realnvp_epochs": 1, "uniform_fraction": 0.0})
+    bold: Any = mi.load_dict(
+        {"type": "pssflow", "guide": "realnvp", "realnvp_epochs": 1, "uniform_fraction": 0.0}
+    )
     with pytest.raises(RuntimeError):
         dr.backward(dr.sum(_image(scene, params, bold), axis=None))
 

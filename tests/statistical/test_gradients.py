@@ -57,7 +57,13 @@ def gradients(
             dr.enable_grad(params[name])
             dr.set_grad(params[name], 0)
         image = mi.render(
-            scene, params, integrator=loaded, seed=seed, seed_grad=seed + 7000, spp=spp, spp_grad=spp
+            scene,
+            params,
+            integrator=loaded,
+            seed=seed,
+            seed_grad=seed + 7000,
+            spp=spp,
+            spp_grad=spp,
         )
         dr.backward(dr.mean(image[..., :3], axis=None))
         found = [np.array(dr.grad(params[name]), np.float64).ravel() for name in names]
@@ -121,12 +127,8 @@ def test_gradients_of_the_whole_light(llvm_variant: str) -> None:
     [
         ("furnace_sphere", "room.bsdf.brdf_0.reflectance.value"),
         ("open_sky", "sky.radiance.value"),
-        pytest.param(
-            "cornell-box", "red.brdf_0.reflectance.value", marks=pytest.mark.long
-        ),
-        pytest.param(
-            "glossy_room", "block.bsdf.brdf_0.weight.value", marks=pytest.mark.long
-        ),
+        pytest.param("cornell-box", "red.brdf_0.reflectance.value", marks=pytest.mark.long),
+        pytest.param("glossy_room", "block.bsdf.brdf_0.weight.value", marks=pytest.mark.long),
     ],
 )
 def test_gradients_are_finite_differences(name: str, parameter: str) -> None:

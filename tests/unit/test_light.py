@@ -70,10 +70,16 @@ def test_one_seed_gives_one_image_on_any_number_of_threads(scene):
 
 def test_what_the_camera_sees_shine(scene):
     """At depth 1 there are lamps alone: in `quad`, white squares of radiance 6 where the lamp is seen from below."""
-    view = scenes.quad() | {"floor": {"type": "rectangle", "emitter": {"type": "area", "radiance": 6.0}}}
+    view = scenes.quad() | {
+        "floor": {"type": "rectangle", "emitter": {"type": "area", "radiance": 6.0}}
+    }
     image = _render(mi.load_dict(view), "none", max_depth=1, spp=4).image
     assert np.unique(np.round(image, 4)).max() == 6.0
-    truth = np.array(mi.render(mi.load_dict(view), integrator=mi.load_dict({"type": "path", "max_depth": 1}), spp=64))
+    truth = np.array(
+        mi.render(
+            mi.load_dict(view), integrator=mi.load_dict({"type": "path", "max_depth": 1}), spp=64
+        )
+    )
     assert abs(image.mean() - truth.mean()) < 0.02 * truth.mean()
 
 
@@ -163,7 +169,9 @@ def test_the_plugin_is_the_function(variant):
 
 def test_the_plugins_channels(llvm_variant):
     scene = mi.load_dict(scenes.furnace_sphere())
-    integrator: Any = mi.load_dict({"type": "pssflow", "guide": "none", "max_depth": 3, "aovs": True})
+    integrator: Any = mi.load_dict(
+        {"type": "pssflow", "guide": "none", "max_depth": 3, "aovs": True}
+    )
     image = np.array(mi.render(scene, integrator=integrator, spp=2), np.float32)
     names = integrator.aov_names()
     assert image.shape[2] == 3 + len(names)

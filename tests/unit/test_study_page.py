@@ -112,7 +112,7 @@ def test_images_and_errors_are_those_of_the_exrs(done, text):
     grey = _decoded(view["error"]).astype(float)
     low, high = page.ERROR_RANGE
     shown = 10 ** (low + grey / 255 * (high - low))
-    error = ((image - truth) ** 2 / (truth**2 + metrics.epsilon(truth))).mean(axis=2)
+    error = ((image - truth) ** 2 / metrics.local_scale(truth)).mean(axis=2)
     lit = (error > 10**low) & (error < 10**high)
     step = (high - low) / (page.LEVELS - 1)
     assert (
@@ -124,7 +124,7 @@ def test_images_and_errors_are_those_of_the_exrs(done, text):
 
 def test_a_large_study_keeps_its_longest_time_only(done, monkeypatch):
     monkeypatch.setattr(page, "MOST_PIXELS", 1000)
-    scenes = page._scenes(done, done.rows)
+    scenes = page.study_scenes(done, done.rows)
     assert {view["time"] for view in scenes[0]["views"]} == {None, 4.0}
 
 

@@ -135,7 +135,7 @@ class _Candidate:
 
     @staticmethod
     def density(guide: Guide, u: F32, pixel: F32) -> NDArray[np.float64]:
-        """q of the numbers that the guide models; the others are uniform."""
+        """Q of the numbers that the guide models; the others are uniform."""
         log_q = guide.log_prob(u[:, : guide.dims], contexts={"pixel": pixel})
         return np.exp(log_q.astype(np.float64))
 
@@ -396,7 +396,9 @@ def _nested(props: Any) -> Any:
     if not isinstance(nested, mi.SamplingIntegrator) or not hasattr(nested, "sample"):
         raise ValueError(f"{what} has no method `sample` that turns numbers into radiance")
     if any(base.__name__ == "PSIntegrator" for base in type(nested).__mro__):
-        raise ValueError(f"{what} draws silhouettes beside paths, which are no function of a path's numbers")
+        raise ValueError(
+            f"{what} draws silhouettes beside paths, which are no function of a path's numbers"
+        )
     if nested.aov_names():
         raise ValueError(
             f"{what} has further channels ({nested.aov_names()[0]}, …), which cannot be divided by a density"

@@ -1,4 +1,4 @@
-"""Charts of a study: error against wall time, and ratios at equal time.
+"""Charts of a study: error against wall time or samples, and ratios at equal ones.
 
 Methods are told apart by colour (Okabe and Ito's palette, which colour-blind readers can tell apart), marker and line,
 so that a copy in black and white can be read, too. Every chart is written as PNG and as SVG.
@@ -7,25 +7,17 @@ so that a copy in black and white can be read, too. Every chart is written as PN
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from numpy.typing import NDArray
-
-from ..files import write_beside
 from ..metrics import Estimate
-from ..picture import display, exposure_of
 from ..report import scene_title
-from .store import Row
+from .drawing import COLOURS, LINES, MARKERS, MUTED, finish, new_figure, plain_ticks
+from .store import ALL, Row
 from .summary import BASELINE, Cell, Overall
 
-__all__ = ["error_chart", "ratio_chart", "strip", "style", "verdict_chart"]
-
-COLOURS = ("#000000", "#e69f00", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#7f7f7f")
-MARKERS = "osD^vPX*<>h"  # not as many as colours: what has the same colour has another marker
-LINES = ("-", "--", "-.", (0, (1, 1)), (0, (5, 1)), (0, (3, 1, 1, 1, 1, 1)))
-MUTED = "#666666"
+__all__ = ["error_chart", "ratio_chart", "style"]
 
 NOISY = ("relmse", "relmse_trimmed")
 """Measures from which the reference's variance is subtracted."""
@@ -54,8 +46,9 @@ def error_chart(
     label: str = "relMSE",
     caption: str = "",
 ) -> list[Path]:
-    """Error against seconds used, log-log, a panel a scene: means over seeds, and a band from the least to the largest.
+    """Error against seconds used, or samples, log-log, a panel a scene.
 
+    Lines are means over seeds, bands reach from the least to the largest.
     Dotted: the slope with which the measure falls, −1 for relMSE. Below the dashed line, shaded, errors drown in the
     truth's own noise.
 
@@ -63,9 +56,10 @@ def error_chart(
         OSError: a file cannot be written.
     """
     scenes = list(dict.fromkeys(row.scene for row in rows))
+    known, methods = methods, [m for m in methods if any(row.method == m for row in rows)]
     columns = min(3, len(scenes))
     lines = math.ceil(len(scenes) / columns)
-    figure = _figure(3.5 * columns + 0.7, 2.9 * lines + 2.1)
+    figure = new_figure(3.5 * columns + 0.7, 2.9 * lines + 2.1)
     for i, scene in enumerate(scenes):
         axes = figure.add_subplot(lines, columns, i + 1)
         own = [row for row in rows if row.scene == scene]
@@ -73,13 +67,18 @@ def error_chart(
         axes.set_yscale("log")
         for method in methods:
             _curve(
-                axes, [row for row in own if row.method == method], measure, style(methods, method)
+                axes, [row for row in own if row.method == method], measure, style(known, method)
             )
         _guides(axes, own, measure)
         _scene_axes(
-            axes, scene_title(scene), label if i % columns == 0 else "", i >= len(scenes) - columns
+            axes,
+            scene_title(scene),
+            label if i % columns == 0 else "",
+            i >= len(scenes) - columns,
+            rows[0].unit,
+            sorted({row.time for row in rows}),
         )
-    handles = _legend_handles(methods)
+    handles = _legend_handles(methods, known)
     from matplotlib.lines import Line2D
 
     if measure in SLOPES:
@@ -89,7 +88,7 @@ def error_chart(
         handles.append(
             Line2D([], [], color=MUTED, linestyle="--", label="the reference’s own variance")
         )
-    return _finish(figure, path, title, handles, caption)
+    return finish(figure, path, title, handles, caption)
 
 
 def ratio_chart(
@@ -105,21 +104,23 @@ def ratio_chart(
     Raises:
         OSError: a file cannot be written.
     """
+    found = [cell for cell in found if cell.light != ALL]
+    unit = found[0].unit
     times = sorted({cell.time for cell in found})
     scenes = list(dict.fromkeys(cell.scene for cell in found))
     others = [method for method in methods if method != BASELINE]
     labels = [*(scene_title(scene) for scene in scenes), "geometric mean"]
     height = 0.16 * max(len(others), 2) + 0.1
-    figure = _figure(3.6 * len(times) + 1.6, height * len(labels) + 2.2)
+    figure = new_figure(3.6 * len(times) + 1.6, height * len(labels) + 2.2)
     first = None
     for i, time in enumerate(times):
         axes = figure.add_subplot(1, len(times), i + 1, sharex=first, sharey=first)
         first = first or axes
         for j, method in enumerate(others):
             points: list[tuple[int, Estimate]] = [
-                (scenes.index(cell.scene), cell.equal_time)
+                (scenes.index(cell.scene), cell.gained)
                 for cell in found
-                if (cell.method, cell.time) == (method, time) and cell.equal_time is not None
+                if (cell.method, cell.time) == (method, time) and cell.gained is not None
             ]
             points += [
                 (len(scenes), total.mean)
@@ -146,18 +147,19 @@ def ratio_chart(
                 axes.axhspan(row - 0.5, row + 0.5, color="#f2f2f2", zorder=0)
         axes.axhline(len(scenes) - 0.5, color=MUTED, linewidth=1)
         axes.set_xscale("log")
-        _plain_ticks(axes.xaxis)
+        plain_ticks(axes.xaxis)
         axes.set_ylim(len(labels) - 0.5, -0.5)
         axes.set_yticks(range(len(labels)), labels)
         axes.tick_params(axis="y", length=0, labelleft=i == 0)
-        axes.set_title(f"{time:g} s", fontsize=10)
+        axes.set_title(f"{time:g} {unit}", fontsize=10)
+        equal = "equal time" if unit == "s" else "equal samples"
         axes.set_xlabel(
-            "relMSE of random sampling ÷ of the guide\n(equal time; right of 1 is a gain)",
+            f"relMSE of random sampling ÷ of the method\n({equal}; right of 1 is a gain)",
             fontsize=8.5,
         )
         axes.grid(axis="x", which="both", color="#dddddd", linewidth=0.5)
         axes.set_axisbelow(True)
-    return _finish(figure, path, title, _legend_handles(others, methods), caption)
+    return finish(figure, path, title, _legend_handles(others, methods), caption)
 
 
 def _curve(axes: Any, rows: Sequence[Row], measure: str, look: dict[str, Any]) -> None:
@@ -170,8 +172,8 @@ def _curve(axes: Any, rows: Sequence[Row], measure: str, look: dict[str, Any]) -
         mean = sum(values) / len(values)
         if mean <= 0.0:
             continue  # drowned: a logarithm has no place for it
-        elapsed = [row.elapsed for row in rows if row.time == time]
-        x.append(sum(elapsed) / len(elapsed))
+        spent = [row.spent for row in rows if row.time == time]
+        x.append(sum(spent) / len(spent))
         y.append(mean)
         low.append(max(min(values), 0.1 * mean))
         high.append(max(values))
@@ -182,7 +184,7 @@ def _curve(axes: Any, rows: Sequence[Row], measure: str, look: dict[str, Any]) -
 
 def _guides(axes: Any, rows: Sequence[Row], measure: str) -> None:
     """The slope, through the middle of what is drawn, and the truth's noise."""
-    values = [(row.elapsed, getattr(row, measure)) for row in rows]
+    values = [(row.spent, getattr(row, measure)) for row in rows]
     positive = [(x, y) for x, y in values if y is not None and y > 0.0]
     if not positive:
         return
@@ -207,27 +209,22 @@ def _guides(axes: Any, rows: Sequence[Row], measure: str) -> None:
             axes.set_ylim(low, high)
 
 
-def _scene_axes(axes: Any, title: str, label: str, last: bool) -> None:
-    _plain_ticks(axes.xaxis)
+def _scene_axes(
+    axes: Any, title: str, label: str, last: bool, unit: str, budgets: Sequence[float]
+) -> None:
+    plain_ticks(axes.xaxis)
+    # Between a few budgets there is nothing to read.
+    axes.set_xticks(budgets, [f"{budget:g}" for budget in budgets])
     axes.set_title(title, fontsize=10)
     axes.set_ylabel(label)
     if last:
-        axes.set_xlabel("wall time used (s)")
+        axes.set_xlabel("wall time used (s)" if unit == "s" else "samples per pixel")
     low, high = axes.get_ylim()
     if low > 1e-3 and high < 1e3 and high < 100.0 * low:
-        _plain_ticks(axes.yaxis)
+        plain_ticks(axes.yaxis)
     axes.grid(which="both", color="#e3e3e3", linewidth=0.5)
     axes.set_axisbelow(True)
     axes.tick_params(labelsize=8, which="both")
-
-
-def _plain_ticks(axis: Any) -> None:
-    """1, 3, 10 in place of 10⁰, 10¹: decades alone leave most of these axes without a number."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    axis.set_major_locator(LogLocator(10, subs=(1.0, 2.0, 5.0), numticks=12))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set_minor_formatter(NullFormatter())
 
 
 def _bars(estimate: Estimate) -> tuple[float, float]:
@@ -245,111 +242,3 @@ def _legend_handles(methods: Sequence[str], all_methods: Sequence[str] | None = 
     return [
         Line2D([], [], label=method, **style(known, method), markersize=5) for method in methods
     ]
-
-
-def _figure(width: float, height: float) -> Any:
-    # No pyplot: it would pick a window system and keep figures alive.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(max(width, 6.4), height), dpi=150, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _finish(
-    figure: Any, path: Path, title: str, handles: Sequence[Any], caption: str
-) -> list[Path]:
-    """Title, legend and caption; then both files."""
-    import textwrap
-
-    width = figure.get_figwidth()
-    wrapped = "\n".join(textwrap.wrap(title, int(width * 11)))
-    figure.suptitle(wrapped, fontsize=11, x=0.01, ha="left")
-    # The caption is the legend's heading: text of its own would lie over the legend.
-    legend = figure.legend(
-        handles=list(handles),
-        loc="outside lower left",
-        ncols=max(1, int(width // 2.1)),
-        fontsize=8.5,
-        frameon=False,
-        title="\n".join(textwrap.wrap(caption, int(width * 14))) or None,
-        title_fontsize=7.5,
-        alignment="left",
-    )
-    legend.get_title().set_color(MUTED)
-    written = [path.with_suffix(".png"), path.with_suffix(".svg")]
-    for target in written:
-        kind = target.suffix[1:]
-        # Without a date two runs over the same rows give the same file.
-        metadata = {"Date": None} if kind == "svg" else None
-        write_beside(
-            target,
-            lambda part, kind=kind, metadata=metadata: figure.savefig(
-                part, format=kind, metadata=metadata
-            ),
-        )
-    return written
-
-
-VERDICT_COLOURS = {"holds": "#009e73", "degrades": "#e69f00", "fails": "#d55e00"}
-"""Okabe and Ito's green, orange and vermilion; the words stand in the cells, too."""
-
-
-def verdict_chart(
-    path: Path,
-    title: str,
-    cases: Sequence[str],
-    methods: Sequence[str],
-    cells: Mapping[tuple[str, str], tuple[str, str]],
-    caption: str = "",
-) -> list[Path]:
-    """A grid of cases × methods; a cell is a verdict of `VERDICT_COLOURS` and its figure. Cells may be missing.
-
-    Raises:
-        OSError: a file cannot be written.
-    """
-    from matplotlib.patches import Patch, Rectangle
-
-    figure = _figure(1.25 * len(methods) + 3.4, 0.38 * len(cases) + 1.9)
-    axes = figure.add_subplot()
-    for row, case in enumerate(cases):
-        for column, method in enumerate(methods):
-            verdict, text = cells.get((case, method), ("", "–"))
-            colour = VERDICT_COLOURS.get(verdict, "#f2f2f2")
-            box = {"facecolor": colour, "edgecolor": "white", "linewidth": 1.5, "alpha": 0.55}
-            axes.add_patch(Rectangle((column, row), 1, 1, **box))
-            shown = f"{verdict}\n{text}" if verdict else text
-            where = {"ha": "center", "va": "center", "fontsize": 6.5}
-            axes.text(column + 0.5, row + 0.5, shown, **where)
-    axes.set_xlim(0, len(methods))
-    axes.set_ylim(len(cases), 0)
-    axes.set_xticks([i + 0.5 for i in range(len(methods))], methods, fontsize=8)
-    axes.set_yticks([i + 0.5 for i in range(len(cases))], cases, fontsize=8)
-    axes.xaxis.tick_top()
-    axes.tick_params(length=0)
-    for spine in axes.spines.values():
-        spine.set_visible(False)
-    handles = [
-        Patch(facecolor=colour, alpha=0.55, label=verdict)
-        for verdict, colour in VERDICT_COLOURS.items()
-    ]
-    return _finish(figure, path, title, handles, caption)
-
-
-def strip(path: Path, title: str, images: Sequence[tuple[str, NDArray[Any]]]) -> None:
-    """Small images side by side under the first one's exposure, each with a line above it; a PNG.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
-    exposure = exposure_of(images[0][1])
-    figure = _figure(1.35 * len(images), 1.75)
-    figure.set_dpi(100)
-    for i, (name, image) in enumerate(images):
-        axes = figure.add_subplot(1, len(images), i + 1)
-        axes.imshow(display(image, exposure), interpolation="nearest")
-        axes.set_title(name, fontsize=7)
-        axes.set_axis_off()
-    figure.suptitle(title, fontsize=8, x=0.01, ha="left")
-    write_beside(path, lambda part: figure.savefig(part, format="png"))

@@ -12,7 +12,7 @@ import click
 
 from ..params import GuideNames, Positive
 from ..terminal import Terminal
-from .times import Times
+from .times import Samples, Times
 
 __all__ = ["Defaults", "study_command"]
 
@@ -51,6 +51,11 @@ def study_command(name: str, defaults: Defaults) -> Callable[[Callable[[], None]
                 ),
                 click.option(
                     "--times", type=Times(), help=f"Seconds, by commas.  [default: {times}]"
+                ),
+                click.option(
+                    "--spp",
+                    type=Samples(),
+                    help="Samples per pixel in place of seconds, as 8,32: rows that repeat but for times.",
                 ),
                 click.option("--seeds", type=click.IntRange(1, 1000), default=3, show_default=True),
                 click.option(
@@ -93,6 +98,7 @@ def _run(
     scenes: tuple[str, ...],
     names: tuple[str, ...] | None,
     times: tuple[float, ...] | None,
+    spp: tuple[float, ...] | None,
     seeds: int,
     pixels: int,
     k: int,
@@ -104,11 +110,14 @@ def _run(
 ) -> None:
     # Mitsuba takes a second to import, and --help should not.
     from .harness import Study
-    from .methods import missing, named_method
+    from .methods import PATH, missing, named_method
     from .report import publish
     from .sceneries import SIX, every_scene, named_scenes, scenery
+    from .store import ALL, BOUNCES
 
     terminal.quiet = quiet
+    if times and spp:
+        raise ValueError("`--times` and `--spp` were both given; give one")
     chosen = []
     for name in names or defaults.methods(full):
         why = missing(name)
@@ -118,14 +127,19 @@ def _run(
             raise ValueError(f"{name}: {why}")
         else:
             terminal.note(f"{name} is left out: {why}")
-    times = times or tuple(defaults.full_times if full else defaults.times)
+    unit = "spp" if spp else "s"
+    times = spp or times or tuple(defaults.full_times if full else defaults.times)
+    # Plain `path` renders all light: scenes of their own, with their truth.
+    lights = [BOUNCES] * any(name != PATH for name in chosen) + [ALL] * (PATH in chosen)
     plans = named_scenes(scenes) if scenes else every_scene() if full else named_scenes(SIX)
     study = Study(
         folder=Path(output),
         sceneries=[
-            scenery(plan, pixels, k, reference_time, not quiet, terminal.note) for plan in plans
+            scenery(plan, pixels, k, reference_time, not quiet, terminal.note, light)
+            for plan in plans
+            for light in lights
         ],
-        methods=[named_method(name, k, threads) for name in chosen],
+        methods=[named_method(name, k, threads, unit) for name in chosen],
         times=times,
         seeds=range(seeds),
         settings={
@@ -137,8 +151,9 @@ def _run(
         },
         say=terminal.say,
         progress=not quiet,
+        unit=unit,
     )
-    heading = title(times, k)
+    heading = title(times, k, unit)
     study.publish = lambda rows: publish(study, rows, heading)
     rows = study.run()
     if not rows:
@@ -150,10 +165,15 @@ def _run(
         terminal.out.print(part, highlight=False, soft_wrap=isinstance(part, str))
 
 
-def title(times: Sequence[float], k: int) -> str:
-    """What a chart shows, and what is inside its time."""
-    shorter = f", snapshots at {', '.join(f'{t:g}' for t in times[:-1])} s" if times[:-1] else ""
+def title(times: Sequence[float], k: int, unit: str = "s") -> str:
+    """What a chart shows, and what is inside its budget."""
     bounces = "1 bounce" if k == 1 else f"{k} bounces"
+    if unit == "spp":
+        return (
+            f"light of exactly {bounces}, all with MIS; a run of each of {', '.join(f'{t:g}' for t in times)} samples "
+            "per pixel for each seed, a guide's pilot inside"
+        )
+    shorter = f", snapshots at {', '.join(f'{t:g}' for t in times[:-1])} s" if times[:-1] else ""
     return (
         f"light of exactly {bounces}, all with MIS; one run of {times[-1]:g} s a seed{shorter}; "
         "pilot, training and selection inside"

@@ -26,7 +26,7 @@ from ..render import Result
 from ..report import count, number, panel, percent, reference_panel
 from ..scene import Scene
 from ..terminal import Terminal, run_command
-from ..thesis import SCENES
+from ..thesis import CAMERA_RAYS, SCENES
 
 SCENE = Path("scenes/teapot/scene.xml")
 
@@ -35,9 +35,6 @@ REFERENCE_SECONDS = 40.0
 
 THESIS = SCENES["teapot"].shares
 """Its Table 2."""
-
-THESIS_RAYS = 1_081_600
-"""Camera rays of the same table."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +65,7 @@ METHODS = (
 )
 
 NOTES = f"""\
-camera rays: here 256² × spp. The thesis' {count(THESIS_RAYS)} are 260² × 16: PBRT samples the filter's border, too.
+camera rays: here 256² × spp. The thesis' {count(CAMERA_RAYS)} are 260² × 16: PBRT samples the filter's border, too.
 found: paths whose two vertices exist; a learned sample outside the cube is a camera ray, but no path found.
 share: non-zero ÷ found. The scene is rebuilt from the thesis' facts, and what exactly it counts as found is not known
 here: compare how a share changes from random to learned, not its level.
@@ -130,7 +127,7 @@ def _write(
             "reference": truth.describe(),
             "runs": [run.stats | {"method": key[1]} for key, run in runs.items()],
             "thesis": {
-                "camera_rays": THESIS_RAYS,
+                "camera_rays": CAMERA_RAYS,
                 "nonzero_share": SCENES["teapot"].describe()["nonzero_share"],
             },
         },

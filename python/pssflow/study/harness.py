@@ -28,9 +28,19 @@ from ..output import make_folder
 from ..progress import Progress
 from ..reference import Reference, read_exr
 from .flip import flip
-from .store import Row, Store, commit, configuration, processor
+from .store import ALL, BOUNCES, Row, Store, commit, configuration, processor
 
-__all__ = ["Case", "Method", "Scenery", "Shot", "Study", "image_path", "reference_path"]
+__all__ = [
+    "ALL",
+    "BOUNCES",
+    "Case",
+    "Method",
+    "Scenery",
+    "Shot",
+    "Study",
+    "image_path",
+    "reference_path",
+]
 
 F32 = NDArray[np.float32]
 
@@ -42,10 +52,10 @@ FAILURES = (OSError, ValueError, RuntimeError)
 
 @dataclass(frozen=True)
 class Shot:
-    """What a method had after a time."""
+    """What a method had after a budget."""
 
     time: float
-    """Seconds that were allowed."""
+    """Seconds that were allowed, or samples per pixel."""
     elapsed: float
     """Seconds that were used."""
     image: F32
@@ -55,12 +65,16 @@ class Shot:
     spp: int
     chosen: str = ""
     nonzero_share: float | None = None
+    parameters: int | None = None
+    """Weights that were learned."""
+    predicted_gain: float | None = None
+    """Variance per path, random ÷ the method's, as held-out paths foretell it; where it was asked for."""
     seconds: Mapping[str, float] = field(default_factory=dict)
     """By phase: `pilot`, `fit`, `render`; `warm_up` is outside of the time."""
 
 
 Runner = Callable[[Any, int, Sequence[float], Progress], Sequence[Shot]]
-"""Renders a case's scene with a seed; returns a shot for each of the increasing times at which there was an image.
+"""Renders a case's scene with a seed; returns a shot for each of the increasing budgets at which there was an image.
 Training is inside them."""
 
 
@@ -74,6 +88,8 @@ class Method:
     """What sets it apart, for the record and the configuration's hash."""
     budget: str = "pilot, training and selection inside"
     """What its time counts."""
+    light: str = BOUNCES
+    """What it renders: only scenes whose truth is that are its own."""
 
 
 @dataclass(frozen=True)
@@ -95,6 +111,8 @@ class Scenery:
 
     name: str
     open: Callable[[], Case]
+    light: str = BOUNCES
+    """What its truth holds."""
 
 
 @dataclass
@@ -105,7 +123,7 @@ class Study:
         folder: where results.csv and the images lie.
         sceneries: the scenes.
         methods: the methods.
-        times: seconds, increasing; a run goes to the last.
+        times: seconds, or samples per pixel, increasing; a run by seconds goes to the last.
         seeds: numbers of the seeds.
         settings: what all runs share, for the rows and the configuration's hash: `k`, `emitter_strategy`, `threads`,
             and whatever else decides a row, as `reference_time`.
@@ -123,6 +141,8 @@ class Study:
     say: Callable[[str], None] = lambda text: None
     progress: Progress = False
     publish: Callable[[Sequence[Row]], object] = lambda rows: None
+    unit: str = "s"
+    """Of the times: `s`, or `spp` for samples per pixel."""
 
     def __post_init__(self) -> None:
         make_folder(self.folder / "images")
@@ -155,17 +175,18 @@ class Study:
         Raises:
             KeyboardInterrupt: on Ctrl-C; finished runs are kept.
         """
-        clock = _Clock(len(self.sceneries) * len(self.methods) * len(self.seeds), self.times[-1])
+        runs = sum(len(self.methods_of(s)) for s in self.sceneries) * len(self.seeds)
+        clock = _Clock(runs, self.times[-1] if self.unit == "s" else 0.0)
         try:
             for scenery in self.sceneries:
                 try:
                     case = scenery.open()
                 except FAILURES as error:
                     self._leave_out(scenery.name, error)
-                    clock.skip(len(self.methods) * len(self.seeds))
+                    clock.skip(len(self.methods_of(scenery)) * len(self.seeds))
                     continue
                 self._digests[scenery.name] = case.digest
-                ran = self._scene(scenery.name, case, clock)
+                ran = self._scene(scenery, case, clock)
                 if ran and scenery is not self.sceneries[-1]:
                     self.publish(self.rows)
         except KeyboardInterrupt:
@@ -183,16 +204,22 @@ class Study:
             method=method.name,
             options=method.options,
             times=list(self.times),
+            unit=self.unit,
             seed=seed,
             settings=dict(self.settings),
         )
 
-    def _scene(self, name: str, case: Case, clock: _Clock) -> bool:
+    def methods_of(self, scenery: Scenery) -> list[Method]:
+        """Those that render what the scene's truth holds."""
+        return [method for method in self.methods if method.light == scenery.light]
+
+    def _scene(self, scenery: Scenery, case: Case, clock: _Clock) -> bool:
         """The runs of one scene; whether there were any."""
+        name, methods = scenery.name, self.methods_of(scenery)
         wanted = []
         for turn, seed in enumerate(self.seeds):
-            shift = turn % len(self.methods)
-            for method in [*self.methods[shift:], *self.methods[:shift]]:
+            shift = turn % max(len(methods), 1)
+            for method in [*methods[shift:], *methods[:shift]]:
                 wanted.append((method, seed, self._key(name, case.digest, method, seed)))
         missing = [run for run in wanted if not self.store.has(run[2])]
         clock.skip(len(wanted) - len(missing))
@@ -239,6 +266,8 @@ class Study:
             "method": method.name,
             "budget": method.budget,
             "seed": seed,
+            "unit": self.unit,
+            "light": method.light,
             "longest": self.times[-1],
             "k": self.settings["k"],
             "emitter_strategy": self.settings["emitter_strategy"],
@@ -260,39 +289,48 @@ class Study:
             # What one sample a pixel says of its variance is infinite, which no reader likes.
             if shot.variance is not None and np.isfinite(shot.variance).all():
                 layers["variance"] = shot.variance
-            path = image_path(self.folder, name, method.name, seed, shot.time)
+            path = image_path(self.folder, name, method.name, seed, shot.time, self.unit)
             _core.write_exr(str(path), layers)
 
     def image_path(self, row: Row) -> Path:
         """Where a row's image lies; of seeds after the first only the last one is kept."""
-        return image_path(self.folder, row.scene, row.method, row.seed, row.time)
+        return image_path(self.folder, row.scene, row.method, row.seed, row.time, row.unit)
 
     def reference_path(self, scene: str) -> Path:
         """Where a scene's truth lies."""
         return reference_path(self.folder, scene)
 
     def floors(self) -> dict[tuple[str, str], metrics.Estimate]:
-        """The squared bias that the last images of several seeds have in common, by scene and method."""
-        found: dict[tuple[str, str], metrics.Estimate] = {}
-        if len(self.seeds) < 2:
-            return found
-        done = {row.run for row in self.rows if row.time == self.times[-1] and row.spp}
-        for scenery in self.sceneries:
-            truth = None
-            for method in self.methods:
-                runs = [(scenery.name, method.name, seed) for seed in self.seeds]
-                if any(run not in done for run in runs):
-                    continue
-                paths = [image_path(self.folder, *run, self.times[-1]) for run in runs]
-                reference = reference_path(self.folder, scenery.name)
-                if not all(path.is_file() for path in (*paths, reference)):
-                    continue
-                truth = truth or read_exr(reference)
-                images = [read_exr(path).image for path in paths]
-                found[scenery.name, method.name] = metrics.floor(
-                    images, truth.image, truth.variance
-                )
+        """See `floors`; of this study's rows."""
+        return floors(self.folder, self.rows, len(self.seeds))
+
+
+def floors(
+    folder: Path, rows: Sequence[Row], seeds: int
+) -> dict[tuple[str, str], metrics.Estimate]:
+    """The squared bias that the last images of several seeds have in common, by scene and method.
+
+    Only where all of so many seeds have their image of the longest budget.
+    """
+    found: dict[tuple[str, str], metrics.Estimate] = {}
+    if seeds < 2:
         return found
+    last = [row for row in rows if row.spp and row.time == row.longest]
+    truths: dict[str, Reference] = {}
+    for scene, method in dict.fromkeys((row.scene, row.method) for row in last):
+        own = [row for row in last if (row.scene, row.method) == (scene, method)]
+        paths = [image_path(folder, scene, method, row.seed, row.time, row.unit) for row in own]
+        place = reference_path(folder, scene)
+        if len(own) < seeds or not all(path.is_file() for path in (*paths, place)):
+            continue
+        if scene not in truths:
+            truths = {scene: read_exr(place)}  # scene after scene: one is held at a time
+        truth = truths[scene]
+        images = [read_exr(path).image for path in paths]
+        found[scene, method] = metrics.floor(
+            images, truth.image, truth.variance, scale=metrics.local_scale(truth.image)
+        )
+    return found
 
 
 def measured(shot: Shot, truth: Reference, common: Mapping[str, Any]) -> Row:
@@ -302,11 +340,15 @@ def measured(shot: Shot, truth: Reference, common: Mapping[str, Any]) -> Row:
         ValueError: the image and the truth differ in size.
     """
     height, width = shot.image.shape[:2]
+    scale = metrics.local_scale(truth.image)
     own = None
     if shot.variance is not None and np.isfinite(shot.variance).all():
-        own = metrics.finite_or_none(metrics.relative_variance(shot.variance, truth.image))
+        own = metrics.finite_or_none(
+            metrics.relative_variance(shot.variance, truth.image, scale=scale)
+        )
     phases: dict[str, Any] = {f"seconds_{phase}": shot.seconds.get(phase) for phase in PHASES}
-    error = metrics.relmse_with_error(shot.image, truth.image, truth.variance)
+    against = (shot.image, truth.image, truth.variance)
+    error = metrics.relmse_with_error(*against, scale=scale)
     return Row(
         **common,
         time=shot.time,
@@ -318,13 +360,16 @@ def measured(shot: Shot, truth: Reference, common: Mapping[str, Any]) -> Row:
         paths=shot.spp * width * height,
         **phases,
         nonzero_share=shot.nonzero_share,
+        parameters=shot.parameters,
+        predicted_gain=shot.predicted_gain,
         relmse=error.value,
         relmse_error=error.error,
-        relmse_trimmed=metrics.relmse_trimmed(shot.image, truth.image, truth.variance),
-        mape=metrics.mape(shot.image, truth.image),
+        relmse_trimmed=metrics.relmse_trimmed(*against, scale=scale),
+        relmse_pixel=metrics.relmse(*against),
+        mape=metrics.mape(shot.image, truth.image, scale=scale),
         flip=flip(shot.image, truth.image),
         own_variance=own,
-        reference_variance=metrics.relative_variance(truth.variance, truth.image),
+        reference_variance=metrics.relative_variance(truth.variance, truth.image, scale=scale),
         reference_seconds=truth.seconds,
     )
 
@@ -345,20 +390,28 @@ def nothing_yet(
         paths=0,
         **phases,
         nonzero_share=None,
+        parameters=None,
+        predicted_gain=None,
         relmse=math.nan,
         relmse_error=math.nan,
         relmse_trimmed=math.nan,
+        relmse_pixel=math.nan,
         mape=math.nan,
         flip=None,
         own_variance=None,
-        reference_variance=metrics.relative_variance(truth.variance, truth.image),
+        reference_variance=metrics.relative_variance(
+            truth.variance, truth.image, scale=metrics.local_scale(truth.image)
+        ),
         reference_seconds=truth.seconds,
     )
 
 
-def image_path(folder: Path, scene: str, method: str, seed: int, seconds: float) -> Path:
+def image_path(
+    folder: Path, scene: str, method: str, seed: int, budget: float, unit: str = "s"
+) -> Path:
     """Where an image of a run lies."""
-    return folder / "images" / f"{file_name(scene)}-{file_name(method)}-s{seed}-{seconds:g}s.exr"
+    name = f"{file_name(scene)}-{file_name(method)}-s{seed}-{budget:g}{unit}"
+    return folder / "images" / f"{name}.exr"
 
 
 def reference_path(folder: Path, scene: str) -> Path:

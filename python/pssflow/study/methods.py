@@ -6,38 +6,54 @@
 | `mitsuba-llvm`    | `pssflow_kbounce` in `llvm_ad_rgb`: Mitsuba's path tracer, for k-bounce light only   |
 | `mitsuba-scalar`  | the same in `scalar_rgb`, where Python is called for every path and takes most of it |
 | `python-vegas`    | Lepage's own package `vegas`, as a guide of pssflow by `guide=` object               |
+| `mitsuba-path`    | Mitsuba's `path` in `llvm_ad_rgb`, all light: on scenes of its own, with their truth |
 
 All of them join the light with MIS. A difference of two renders is none: it would render the directly lit scene as
-well, only to throw it away.
+well, only to throw it away. `mitsuba-path` renders something else than the others, so that it has a truth of its own
+and is compared with none of them.
 """
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from ..guide import choose, guide_names
+from ..passes import AllLightPass, KBouncePass, Pass
 from ..progress import Progress, reporting
-from ..reference import KBouncePass, Running
+from ..reference import Running
 from ..render import Result
 from ..scene import Scene
 from ..variants import llvm_problem
 from .harness import Method, Shot
+from .store import ALL, BOUNCES
 
-__all__ = ["OTHERS", "Stage", "method_names", "missing", "named_method", "shot_of"]
+__all__ = [
+    "OTHERS",
+    "PATH",
+    "Stage",
+    "guided",
+    "method_names",
+    "missing",
+    "named_method",
+    "shot_of",
+]
+
+PATH = "mitsuba-path"
 
 MITSUBA = {"mitsuba-llvm": "llvm_ad_rgb", "mitsuba-scalar": "scalar_rgb"}
 """Name → Mitsuba's variant."""
 
 VEGAS = "python-vegas"
 
-OTHERS = (*MITSUBA, VEGAS)
+OTHERS = (*MITSUBA, VEGAS, PATH)
 """Methods that are no guide of pssflow's own."""
 
 PATHS_PER_PASS = (1 << 18, 1 << 20)
@@ -83,7 +99,7 @@ def missing(name: str) -> str | None:
     """
     from importlib.util import find_spec
 
-    if name == "mitsuba-llvm":
+    if name in ("mitsuba-llvm", PATH):
         return llvm_problem()
     if name == VEGAS:
         if find_spec("vegas") is None:
@@ -97,77 +113,98 @@ def missing(name: str) -> str | None:
     return None
 
 
-def named_method(name: str, k: int, threads: int | None) -> Method:
-    """The method of that name."""
-    if name in MITSUBA:
-        return _mitsuba(name, MITSUBA[name], k, threads)
+def named_method(name: str, k: int, threads: int | None, unit: str = "s") -> Method:
+    """The method of that name; its budgets are seconds, or with the unit `spp` samples per pixel."""
+    if name in MITSUBA or name == PATH:
+        return _mitsuba(name, MITSUBA.get(name, "llvm_ad_rgb"), k, threads, unit)
     if name == VEGAS:
         from importlib.metadata import version
 
         from .vegas_guide import VegasGuide
 
-        return _pssflow(name, VegasGuide, k, threads, {"vegas": version("vegas")})
-    return _pssflow(name, lambda: name, k, threads, {})
+        return guided(name, VegasGuide, k, threads, {"vegas": version("vegas")}, unit)
+    return guided(name, lambda: name, k, threads, {}, unit)
 
 
-def _pssflow(
+def guided(
     name: str,
     guide: Callable[[], Any],
     k: int,
     threads: int | None,
     options: Mapping[str, Any],
+    unit: str = "s",
+    predict: Callable[[Scene, Result], float | None] = lambda scene, result: None,
+    **guide_options: Any,
 ) -> Method:
-    """A guide, made anew for each run; one render with snapshots."""
+    """A guide, made anew for each run: one render with snapshots by time, one for each budget by samples.
+
+    Args:
+        name: as the charts have it.
+        guide: gives a guide's name or object.
+        k: bounces.
+        threads: None for all cores.
+        options: for the record.
+        unit: `s` or `spp`.
+        predict: asked for the gain after the time is over.
+        **guide_options: the guide's own.
+    """
 
     def run(stage: Stage, seed: int, times: Sequence[float], progress: Progress) -> list[Shot]:
-        whole = stage.scene.render(
-            guide(),
-            time=times[-1],
-            snapshots=times[:-1],
-            k=k,
-            threads=threads,
-            seed=seed,
-            progress=progress,
-        )
-        parts = (*whole.snapshots, whole)
-        return [shot_of(part, seconds) for part, seconds in zip(parts, times, strict=True)]
+        common: dict[str, Any] = {"k": k, "threads": threads, "seed": seed, "progress": progress}
+        common |= guide_options
+        if unit == "spp":
+            parts = tuple(stage.scene.render(guide(), spp=int(spp), **common) for spp in times)
+        else:
+            whole = stage.scene.render(guide(), time=times[-1], snapshots=times[:-1], **common)
+            parts = (*whole.snapshots, whole)
+        shots = [shot_of(part, budget) for part, budget in zip(parts, times, strict=True)]
+        return [*shots[:-1], replace(shots[-1], predicted_gain=predict(stage.scene, parts[-1]))]
 
     inside = "rendering" if name == "none" else "pilot, training, selection and rendering"
-    return Method(name, run, options, budget=f"{inside} inside; loading and BVH outside")
+    budget = f"{inside} inside; loading and BVH outside"
+    if unit == "spp":
+        budget = "all samples of the render" if name == "none" else "the pilot's samples inside"
+    return Method(name, run, options, budget=budget)
 
 
-def shot_of(result: Result, seconds: float) -> Shot:
+def shot_of(result: Result, budget: float) -> Shot:
     """A render of ours as a study takes it."""
     stats = result.stats
     # Before its pilot is over a guide has drawn nothing: the pilot's share then is all there is.
     drawn = stats["nonzero_share"] if stats["paths_found"] else stats["pilot"]["nonzero_share"]
     return Shot(
-        time=seconds,
+        time=budget,
         elapsed=stats["elapsed"],
         image=result.image,
         variance=result.variance,
         spp=sum(part["spp"] for part in stats["passes"]),
         chosen=stats["chosen"],
         nonzero_share=drawn,
+        parameters=((stats["training"] or {}).get("guide") or {}).get("parameters"),
         seconds={phase: stats["seconds"][phase] for phase in ("pilot", "fit", "render")},
     )
 
 
-def _mitsuba(name: str, variant: str, k: int, threads: int | None) -> Method:
-    """Mitsuba's path tracer for k-bounce light, in passes until the time is over."""
+def _mitsuba(name: str, variant: str, k: int, threads: int | None, unit: str) -> Method:
+    """Mitsuba's path tracer, for k-bounce light or for all, in passes until the time or the samples are over."""
 
     def run(stage: Stage, seed: int, times: Sequence[float], progress: Progress) -> list[Shot]:
         if name in stage.too_slow:
             return []
-        if stage.scene.hide_emitters:
+        if stage.scene.hide_emitters and name != PATH:
             raise ValueError("`hide_emitters` is set, which pssflow_kbounce does not know")
         before = stage.scene.variant
         try:
             scene = stage.in_variant(variant)
-            one = KBouncePass(scene, 0, k)
+            one: Pass = (
+                AllLightPass(scene, 0, hide=stage.scene.hide_emitters)
+                if name == PATH
+                else KBouncePass(scene, 0, k)
+            )
             try:
                 with _threads(threads), reporting(progress) as listener:
-                    shots = _passes(one, name, seed, stage.scene, times, listener)
+                    passes = _counted if unit == "spp" else _passes
+                    shots = passes(one, name, seed, stage.scene, times, listener)
             finally:
                 one.restore()
         finally:
@@ -179,11 +216,48 @@ def _mitsuba(name: str, variant: str, k: int, threads: int | None) -> Method:
         return shots
 
     budget = "rendering inside; loading and compiling outside"
-    return Method(name, run, {"integrator": "pssflow_kbounce", "variant": variant}, budget=budget)
+    options = {"integrator": "path" if name == PATH else "pssflow_kbounce", "variant": variant}
+    return Method(
+        name,
+        run,
+        options,
+        budget="all samples of the render" if unit == "spp" else budget,
+        light=ALL if name == PATH else BOUNCES,
+    )
+
+
+def _counted(
+    render: Pass,
+    name: str,
+    seed: int,
+    scene: Scene,
+    budgets: Sequence[float],
+    listener: Callable[[str, float], None] | None,
+) -> list[Shot]:
+    """Whole passes until each number of samples is reached; at least two to the first one, for a variance."""
+    wanted = [int(spp) for spp in budgets]
+    pixels = scene.width * scene.height
+    common = math.gcd(*wanted)
+    most = max(min(PATHS_PER_PASS[0] // pixels, common // 2), 1)
+    # All passes are of one size, and end at each budget.
+    spp = max(size for size in range(1, most + 1) if common % size == 0)
+    state = Running.empty([scene.width, scene.height], spp)
+    start = time.perf_counter()
+    shots = []
+    first = (seed + 1) << 20
+    for budget in wanted:
+        while state.spp < budget:
+            image, drawn, bad = render(first + state.passes, spp)
+            state = state.with_pass(image, spp=drawn, non_finite=bad, seconds=0.0)
+            if listener is not None:
+                listener("render", state.spp / wanted[-1])
+        elapsed = time.perf_counter() - start
+        shots.append(_shot(state, budget, elapsed, name, {"render": elapsed}))
+    return shots
 
 
 def _passes(
-    render: KBouncePass,
+    render: Pass,
     name: str,
     seed: int,
     scene: Scene,
@@ -223,15 +297,7 @@ def _passes(
             shots.append(None if not state.passes else shot(times[len(shots)]))
 
     def shot(at: float) -> Shot:
-        return Shot(
-            time=at,
-            elapsed=elapsed,
-            image=state.mean.astype(np.float32),
-            variance=state.variance().astype(np.float32) if state.passes > 1 else None,
-            spp=state.spp,
-            chosen=name,
-            seconds={"render": elapsed, "warm_up": warm_up},
-        )
+        return _shot(state, at, elapsed, name, {"render": elapsed, "warm_up": warm_up})
 
     while elapsed + longest <= times[-1]:
         begun = time.perf_counter()
@@ -248,6 +314,21 @@ def _passes(
             listener("render", elapsed / times[-1])
     shoot(float("inf"))
     return [taken for taken in shots if taken is not None]
+
+
+def _shot(
+    state: Running, budget: float, elapsed: float, name: str, seconds: Mapping[str, float]
+) -> Shot:
+    """What passes have come to."""
+    return Shot(
+        time=budget,
+        elapsed=elapsed,
+        image=state.mean.astype(np.float32),
+        variance=state.variance().astype(np.float32) if state.passes > 1 else None,
+        spp=state.spp,
+        chosen=name,
+        seconds=seconds,
+    )
 
 
 @contextmanager

@@ -17,7 +17,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..reference import TruthPass
+from ..passes import TruthPass
 from ..scene import Scene
 from .welch import Verdict, welch_where_power
 

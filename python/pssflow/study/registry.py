@@ -9,6 +9,10 @@ import click
 __all__ = ["STUDIES", "Studies"]
 
 STUDIES = {
+    "thesis": (
+        "thesis",
+        "The source thesis reproduced: its tables and figures beside ours, and what it left open.",
+    ),
     "guides": (
         "guides",
         "What each guide gains, costs and comes to at equal time; what `auto` chose.",
@@ -20,6 +24,14 @@ STUDIES = {
     "stability": (
         "stability.command",
         "Planted failures: what holds, degrades or fails with each guide, and with the thesis' method.",
+    ),
+    "capacity": (
+        "capacity",
+        "Error and predicted gain against the size of the model at equal time: how small is enough.",
+    ),
+    "results": (
+        "results",
+        "docs/results.md from a finished study: wins and losses of every method, and how it was measured.",
     ),
 }
 """Name → the module in this package that defines a command of that name, and what it shows."""

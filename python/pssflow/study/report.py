@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from rich.table import Table
@@ -18,21 +19,41 @@ from .charts import NOISY, error_chart, ratio_chart
 from .flip import has_flip
 from .harness import Study
 from .methods import OTHERS
-from .page import Chart, write_page
-from .store import Row
+from .page import Chart, study_scenes, write_page
+from .store import ALL, Row
 from .summary import BASELINE, CLOSE, Cell, Choice, Overall, cells, choices, overall, reaches
 
-__all__ = ["biased", "publish"]
+__all__ = [
+    "NOTES",
+    "Sheet",
+    "bias_lines",
+    "biased",
+    "budgets",
+    "choice_lines",
+    "errors_sheet",
+    "machine_lines",
+    "noisy_references",
+    "publish",
+    "rich_table",
+    "sums_sheet",
+    "too_early",
+    "with_error",
+    "write_summary",
+]
 
 NOTES = """\
-relMSE, and the variance that an image says of itself, are relative to the reference (docs of pssflow.metrics); of
-relMSE the reference's own variance is subtracted, * lies below it. “trimmed” leaves out the worst 0.1 % of pixels,
-which hides fireflies. MAPE and FLIP (HDR-FLIP's mean, 0 … 1) hold the reference's noise. variance × time: the image's
-own, in seconds. Time to an error: where the line of means over seeds crosses it on logarithmic axes, never beyond what
-was measured. Ratios are those of random sampling (none) ÷ the method: above 1 is a gain; but cost is the method's ÷
-random's. gain / path: the images' own variance; equal samples and equal time: relMSE; cost: seconds a path with pilot
-and training inside. ± is one standard error over seeds; win and loss are beyond two. A time shorter than the run is a
-snapshot of it: its pilot was planned for the whole."""
+relMSE, and the variance that an image says of itself, are relative to the square of the reference about each pixel,
+in the mean of its 24 neighbours: by its own square, as is usual (relmse_pixel in results.csv), a noisy reference
+makes all errors too large and all ratios too near 1. Of relMSE the reference's own variance is subtracted, * lies
+below it. “trimmed” leaves out the worst 0.1 % of pixels, which hides fireflies. MAPE and FLIP (HDR-FLIP's mean, 0 …
+1) hold the reference's noise. variance × budget: the image's own, in seconds or samples. Time (samples) to an error:
+where the line of means over seeds crosses it on logarithmic axes, never beyond what was measured. Ratios are those of
+random sampling (none) ÷ the method: above 1 is a gain; but cost is the method's ÷ random's. gain / path: the images'
+own variance; equal samples and equal time: relMSE; cost: seconds a path with pilot and training inside. ± is one
+standard error over seeds; win and loss are beyond two, at equal time or, where the budget is samples, at equal
+samples. A time shorter than the run is a snapshot of it: its pilot was planned for the whole. “All light” is
+Mitsuba's path against its own reference: it renders something else than the others, and is compared with none of
+them."""
 
 MEASURES = {
     "relmse": ("error", "Error against time", "relMSE"),
@@ -75,49 +96,64 @@ def publish(study: Study, rows: Sequence[Row], title: str) -> list[Any]:
     total = overall(found)
     picked = choices(found, competitors=OTHERS) if "auto" in methods else []
     sheets = [
-        *([_sums(total)] if total else []),
-        _errors(found),
+        *([sums_sheet(total, study.unit)] if total else []),
+        errors_sheet(found),
         *([_ratios(found)] if total else []),
-        _times_to_errors(found),
+        *([sheet] if (sheet := _times_toerrors_sheet(found, study.unit)).rows else []),
     ]
     lines = [
         *biased(study, rows),
-        *_choice_lines(picked),
-        *_too_early(early),
-        *_noisy_references(rows),
+        *choice_lines(picked, study.unit),
+        *too_early(early),
+        *noisy_references(rows),
         *_failures(study),
-        *_budgets(rows),
+        *budgets(rows),
         *([] if has_flip() else ["FLIP is not measured: the package flip-evaluator is missing"]),
-        *_machine(rows or early),
+        *machine_lines([vars(row) for row in rows or early], rows[0].processor, rows[0].mitsuba),
     ]
     heading = title[0].upper() + title[1:]
-    parts = [f"# {heading}"]
-    for sheet in sheets:
-        parts += [
-            f"## {sheet.title}",
-            markdown_table(sheet.headings, sheet.rows, texts=sheet.texts),
-        ]
-    text = "\n\n".join([*parts, NOTES, *lines])
-    write_beside(
-        study.folder / "summary.md", lambda part: part.write_text(text + "\n", encoding="utf-8")
-    )
+    write_summary(study.folder / "summary.md", heading, sheets, [NOTES, *lines])
     charts = _charts(study, rows, methods, found, total, title) if rows else []
-    write_page(study, rows, heading, sheets, charts, lines, NOTES)
-    shown: list[Any] = [_rich(sheet) for sheet in [*sheets[1:], *sheets[:1]]]
+    write_page(
+        study.folder,
+        heading,
+        sheets=sheets,
+        charts=charts,
+        scenes=study_scenes(study, rows),
+        lines=lines,
+        notes=NOTES,
+        unit=study.unit,
+    )
+    shown: list[Any] = [rich_table(sheet) for sheet in [*sheets[1:], *sheets[:1]]]
     written = f"wrote {study.folder}: report.html, results.csv, summary.md, charts, images"
     return [*shown, NOTES, *lines, written]
 
 
-def _errors(found: Sequence[Cell]) -> Sheet:
+def write_summary(path: Path, heading: str, sheets: Sequence[Sheet], lines: Sequence[str]) -> None:
+    """Tables and findings as Markdown.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    parts = [f"# {heading}"]
+    for sheet in sheets:
+        table = markdown_table(sheet.headings, sheet.rows, texts=sheet.texts)
+        parts += [f"## {sheet.title}", table]
+    text = "\n\n".join([*parts, *lines])
+    write_beside(path, lambda part: part.write_text(text + "\n", encoding="utf-8"))
+
+
+def errors_sheet(found: Sequence[Cell]) -> Sheet:
+    """Errors by scene, method and budget."""
     headings = (
-        *("scene", "method", "time", "spp", "relMSE", "trimmed", "MAPE", "FLIP", "non-zero"),
-        *("own variance", "variance × time"),
+        *("scene", "method", "budget", "spp", "relMSE", "trimmed", "MAPE", "FLIP", "non-zero"),
+        *("own variance", "variance × budget"),
     )
     table = [
         [
             scene_title(cell.scene),
             cell.method + (f" → {_names(cell.chosen)}" if cell.method == "auto" else ""),
-            f"{cell.time:g} s",
+            f"{cell.time:g} {cell.unit}",
             number(cell.spp, 3),
             with_error(cell.relmse) + ("*" if cell.drowned else ""),
             with_error(cell.relmse_trimmed),
@@ -134,14 +170,14 @@ def _errors(found: Sequence[Cell]) -> Sheet:
 
 def _ratios(found: Sequence[Cell]) -> Sheet:
     headings = (
-        *("scene", "method", "time", "gain / path", "cost / path", "equal samples"),
+        *("scene", "method", "budget", "gain / path", "cost / path", "equal samples"),
         *("equal time", "verdict"),
     )
     table = [
         [
             scene_title(cell.scene),
             cell.method,
-            f"{cell.time:g} s",
+            f"{cell.time:g} {cell.unit}",
             with_error(cell.gain),
             with_error(cell.cost),
             with_error(cell.equal_samples),
@@ -149,12 +185,12 @@ def _ratios(found: Sequence[Cell]) -> Sheet:
             cell.verdict,
         ]
         for cell in found
-        if cell.method != BASELINE
+        if cell.method != BASELINE and cell.gained is not None
     ]
     return Sheet("Ratios to random sampling", headings, table)
 
 
-def _times_to_errors(found: Sequence[Cell]) -> Sheet:
+def _times_toerrors_sheet(found: Sequence[Cell], unit: str) -> Sheet:
     """A row for each scene and error, a column for each method."""
     known = reaches(found)
     methods = list(dict.fromkeys(reach.method for reach in known))
@@ -173,18 +209,21 @@ def _times_to_errors(found: Sequence[Cell]) -> Sheet:
         ]
         for scene, target in places
     ]
-    return Sheet("Time to an error", ("scene", "relMSE", *methods), table, texts=1)
+    what = "Time to an error" if unit == "s" else "Samples to an error"
+    return Sheet(what, ("scene", "relMSE", *methods), table, texts=1)
 
 
-def _sums(total: Sequence[Overall]) -> Sheet:
+def sums_sheet(total: Sequence[Overall], unit: str) -> Sheet:
+    """A line for each method and budget, over all scenes."""
+    equal = "equal time" if unit == "s" else "equal samples"
     headings = (
-        *("method", "time", "scenes", "equal time, geometric mean", "gain / path"),
+        *("method", "budget", "scenes", f"{equal}, geometric mean", "gain / path"),
         *("wins / ties / losses", "worst"),
     )
     table = [
         [
             o.method,
-            f"{o.time:g} s",
+            f"{o.time:g} {unit}",
             str(o.scenes),
             with_error(o.mean),
             with_error(o.gain),
@@ -208,18 +247,32 @@ def _charts(
     seeds = "1 seed" if len(study.seeds) == 1 else f"{len(study.seeds)} seeds"
     where = f"{rows[0].width}×{rows[0].height} pixels and the like, {seeds}, {rows[0].processor}"
     charts = []
+    everything = [row for row in rows if row.light == ALL]
+    rows = [row for row in rows if row.light != ALL]
     for measure, (name, heading, label) in MEASURES.items():
         if all(getattr(row, measure) is None for row in rows):
             continue
+        heading = heading.replace("time", "samples") if study.unit == "spp" else heading
         noise = "" if measure in NOISY else " It holds the reference’s noise."
         bands = "lines are means over seeds, bands reach from the least to the largest. "
         bands = bands if len(study.seeds) > 1 else ""
-        caption = f"{where}; {bands}points lie at the seconds really used.{noise}"
+        used = "points lie at the seconds really used." if study.unit == "s" else ""
+        caption = f"{where}; {bands}{used}{noise}"
         path = study.folder / f"{name}.png"
         heading = f"{heading}: {title}"
         error_chart(path, heading, rows, methods, measure=measure, label=label, caption=caption)
         charts.append(Chart(path.with_suffix(".svg"), heading, first=measure == "relmse"))
-    if any(method != BASELINE for method in methods) and any(c.equal_time for c in found):
+    if everything:
+        path = study.folder / "error-all-light.png"
+        heading = (
+            "All light: Mitsuba's path against its own reference; "
+            + title.partition(";")[2].strip()
+        )
+        caption = f"{where}. Another quantity than in the other charts, hence not to be compared with them."
+        error_chart(path, heading, everything, methods, caption=caption)
+        charts.append(Chart(path.with_suffix(".svg"), heading))
+    methods = [method for method in methods if any(row.method == method for row in rows)]
+    if any(method != BASELINE for method in methods) and any(c.gained for c in found):
         path = study.folder / "ratio.png"
         heading = f"Gain over random sampling: {title}"
         bars = f"Bars: two standard errors over {seeds}. {rows[0].processor}."
@@ -236,26 +289,30 @@ BIAS_SHARE = 0.05
 
 
 NOISY_REFERENCE = 0.1
-"""Relative standard error of a reference above which relMSE itself is off: it divides by the reference's square."""
+"""Relative standard error of a reference above which its noise is told, and random sampling is not called biased."""
 
 
 def biased(study: Study, rows: Sequence[Row]) -> list[str]:
+    """`bias_lines` of a study."""
+    return bias_lines(study.floors(), rows)
+
+
+def bias_lines(floors: Mapping[tuple[str, str], Estimate], rows: Sequence[Row]) -> list[str]:
     """A line for each method whose seeds err in common: what no time takes away.
 
     A noisy reference makes all methods err in common, so that it is what random sampling has not that counts, if that
     was measured. Told beyond four standard errors (dozens are tested), and where it makes a twentieth of the relMSE.
     """
     lines = []
-    floors = study.floors()
     for (scene, method), floor in floors.items():
         last = [
             row.relmse
             for row in rows
-            if (row.scene, row.method, row.time) == (scene, method, study.times[-1])
+            if (row.scene, row.method) == (scene, method) and row.time == row.longest
         ]
         error = sum(last) / len(last)
-        base = floors.get((scene, BASELINE), Estimate(0.0, 0.0))
-        if method == BASELINE:
+        base = floors.get((scene, BASELINE))
+        if method == BASELINE or base is None:
             base = Estimate(0.0, 0.0)
             if _reference_error(rows, scene) > NOISY_REFERENCE:
                 continue
@@ -272,14 +329,16 @@ def _reference_error(rows: Sequence[Row], scene: str) -> float:
     return math.sqrt(max(row.reference_variance for row in rows if row.scene == scene))
 
 
-def _noisy_references(rows: Sequence[Row]) -> list[str]:
+def noisy_references(rows: Sequence[Row]) -> list[str]:
+    """A line for each reference whose noise is to be known."""
     lines = []
     for scene in dict.fromkeys(row.scene for row in rows):
         error = _reference_error(rows, scene)
         if error > NOISY_REFERENCE:
             lines.append(
-                f"the reference of {scene_title(scene)} is noisy (relative standard error {number(error, 2)}): "
-                "its relMSE is too large for all methods, and its ratios too near 1; raise --reference-time"
+                f"the reference of {scene_title(scene)} is noisy (relative standard error {number(error, 2)}): its own "
+                "variance is subtracted, but what it has of chance is the same in every relMSE and in no ±; look at "
+                "gain / path, which asks the images alone, or raise --reference-time"
             )
     return lines
 
@@ -299,16 +358,17 @@ def _names(chosen: str) -> str:
     return ", ".join(dict.fromkeys(re.sub(r" *\([^)]*\)", "", part) for part in chosen.split("/")))
 
 
-def _choice_lines(picked: Sequence[Choice]) -> list[str]:
+def choice_lines(picked: Sequence[Choice], unit: str) -> list[str]:
+    """How often `auto` came near the best, and where it did not."""
     if not picked:
         return []
     close = sum(choice.close for choice in picked)
     told = [
         f"auto is within {100 * (CLOSE - 1):.0f} % of the best candidate in hindsight, beyond two standard errors, in "
-        f"{close} of {len(picked)} cases of scene and time."
+        f"{close} of {len(picked)} cases of scene and budget."
     ]
     told += [
-        f"not so: {scene_title(c.scene)} at {c.time:g} s, {with_error(c.over)} times the error of {c.best}"
+        f"not so: {scene_title(c.scene)} at {c.time:g} {unit}, {with_error(c.over)} times the error of {c.best}"
         for c in picked
         if not c.close
     ]
@@ -319,13 +379,16 @@ def _failures(study: Study) -> list[str]:
     return [f"left out: {name}: {why}" for name, why in study.failures.items()]
 
 
-def _machine(rows: Sequence[Row]) -> list[str]:
-    loads = [max(row.load_before, row.load_after) for row in rows]
-    commits = ", ".join(sorted({row.commit for row in rows}))
+def machine_lines(
+    ran: Sequence[Mapping[str, Any]], processor: str, mitsuba: str | None = None
+) -> list[str]:
+    """Processor, load and commit of runs that have `load_before`, `load_after` and `commit`; crowds are told first."""
+    loads = [max(run["load_before"], run["load_after"]) for run in ran]
+    commits = ", ".join(sorted({run["commit"] for run in ran}))
     mean, cores = sum(loads) / len(loads), os.cpu_count() or 1
     lines = [
-        f"{rows[0].processor}; load average up to {max(loads):.1f}, in the mean {mean:.1f}; "
-        f"commit {commits}; Mitsuba {rows[0].mitsuba}."
+        f"{processor}; load average up to {max(loads):.1f}, in the mean {mean:.1f}; "
+        f"commit {commits}{'' if mitsuba is None else f'; Mitsuba {mitsuba}'}."
     ]
     if mean > CROWDED * cores:
         lines.insert(
@@ -336,7 +399,7 @@ def _machine(rows: Sequence[Row]) -> list[str]:
     return lines
 
 
-def _too_early(early: Sequence[Row]) -> list[str]:
+def too_early(early: Sequence[Row]) -> list[str]:
     """Times at which a method had no image yet."""
     times: dict[tuple[str, str], set[float]] = {}
     for row in early:
@@ -347,17 +410,18 @@ def _too_early(early: Sequence[Row]) -> list[str]:
     ]
 
 
-def _budgets(rows: Sequence[Row]) -> list[str]:
+def budgets(rows: Sequence[Row]) -> list[str]:
     """What each method's time counts."""
     methods: dict[str, list[str]] = {}
     for row in rows:
         named = methods.setdefault(row.budget, [])
         if row.method not in named:
             named.append(row.method)
-    return [f"time of {', '.join(names)}: {budget}" for budget, names in methods.items()]
+    return [f"budget of {', '.join(names)}: {budget}" for budget, names in methods.items()]
 
 
-def _rich(sheet: Sheet) -> Table:
+def rich_table(sheet: Sheet) -> Table:
+    """A table for the terminal."""
     table = Table(title=sheet.title, title_justify="left")
     for i, heading in enumerate(sheet.headings):
         table.add_column(heading, justify="left" if i < sheet.texts else "right")

@@ -14,6 +14,7 @@ from . import parity
 from .harness import Case, Scenery
 from .methods import Stage
 from .parity import Plan
+from .store import ALL, BOUNCES
 
 __all__ = ["SIX", "every_scene", "named_scenes", "scenery"]
 
@@ -62,8 +63,13 @@ def scenery(
     reference_time: float,
     progress: Progress = False,
     note: Callable[[str], object] = lambda text: None,
+    light: str = BOUNCES,
 ) -> Scenery:
-    """A scene whose film has about so many pixels; its truth is Mitsuba's, cached under the scene's hash."""
+    """A scene whose film has about so many pixels; its truth is Mitsuba's, cached under the scene's hash.
+
+    With `light` = `all` it is a scene of another name, whose truth is the whole image.
+    """
+    name = plan.name if light == BOUNCES else f"{plan.name}, all light"
 
     def open_it() -> Case:
         import mitsuba as mi
@@ -87,8 +93,10 @@ def scenery(
             note(f"{plan.name}: {text}")
 
         def truth() -> Reference:
-            found = reference(scene, k, seconds=reference_time, progress=progress)
-            note(f"{plan.name}: reference: {found.note}")
+            found = reference(
+                scene, k, seconds=reference_time, progress=progress, all_light=light == ALL
+            )
+            note(f"{name}: reference: {found.note}")
             return found
 
         def warm_up() -> None:
@@ -97,4 +105,4 @@ def scenery(
         stage = Stage(scene, load_resized)
         return Case(digest=scene.hash, scene=stage, truth=truth, warm_up=warm_up)
 
-    return Scenery(plan.name, open_it)
+    return Scenery(name, open_it, light)

@@ -10,7 +10,7 @@ from .command import Defaults, study_command
 
 __all__ = ["speed_accuracy"]
 
-STANDARD = ("none", "table", "auto", "mitsuba-llvm", "python-vegas")
+STANDARD = ("none", "table", "auto", "mitsuba-llvm", "python-vegas", "mitsuba-path")
 
 
 def standard(full: bool) -> list[str]:
@@ -35,6 +35,8 @@ def standard(full: bool) -> list[str]:
 )
 def speed_accuracy() -> None:
     """Error against wall time: guides, Mitsuba (mitsuba-llvm, mitsuba-scalar) and python-vegas, training inside.
+
+    mitsuba-path is all light by Mitsuba's path, against its own reference: charted apart, compared with no other.
 
     SCENES are XML files or names (`scenes/door-ajar`, `veach-ajar`); the default are six. Writes results.csv, tables,
     charts, EXRs and report.html, which opens without a network, to DIR; run again, it goes on where it stopped.

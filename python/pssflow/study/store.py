@@ -20,12 +20,15 @@ from typing import Any
 
 from ..files import first_line, write_beside
 
-__all__ = ["Row", "Store", "commit", "configuration", "processor"]
+__all__ = ["ALL", "BOUNCES", "Row", "Store", "commit", "configuration", "processor", "write_rows"]
+
+BOUNCES, ALL = "k bounces", "all"
+"""What a truth, and a method, holds: light of exactly k bounces, or all light. The two are never compared."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One image and its errors. Radiances are relative to the reference, as in relMSE (`pssflow.metrics`)."""
+    """One image and its errors, relative to the reference about each pixel (`pssflow.metrics.local_scale`)."""
 
     scene: str
     scene_hash: str
@@ -33,13 +36,17 @@ class Row:
     method: str
     seed: int
     time: float
-    """Budget in seconds; `budget` says what is inside."""
+    """Budget in seconds, or samples per pixel; `budget` says what is inside."""
+    unit: str
+    """Of the budget: `s` or `spp`."""
+    light: str
+    """What was rendered: light of `k bounces`, or `all`."""
     budget: str
     """What the time counts and what it does not, in words."""
     elapsed: float
     """Seconds really used."""
     longest: float
-    """Seconds of the run that this is a part of."""
+    """Budget of the run that this is a part of; by samples, each is a run of its own."""
     chosen: str
     """What drew the last pass."""
     width: int
@@ -56,10 +63,17 @@ class Row:
     """Outside of the time: compiling, where the method does."""
     nonzero_share: float | None
     """Paths that carry light, of those found."""
+    parameters: int | None
+    """Weights that the method learned."""
+    predicted_gain: float | None
+    """Variance per path, random ÷ the method's, foretold by held-out paths."""
     relmse: float
     relmse_error: float
     """Standard error from the spread between pixels."""
     relmse_trimmed: float
+    relmse_pixel: float
+    """RelMSE by its usual formula, ÷ each pixel's own square: comparable with other programs, and off where the
+    reference is noisy."""
     mape: float
     flip: float | None
     """Mean of HDR-FLIP; None where the package `flip-evaluator` is missing."""
@@ -81,6 +95,11 @@ class Row:
     mitsuba: str
     processor: str
     when: str
+
+    @property
+    def spent(self) -> float:
+        """What was used of the budget, in its unit."""
+        return self.elapsed if self.unit == "s" else float(self.spp)
 
     @property
     def run(self) -> tuple[str, str, int]:
@@ -144,15 +163,24 @@ class Store:
         new = list(rows)
         runs = {row.run for row in new}
         self.rows = [row for row in self.rows if row.run not in runs] + new
+        write_rows(self.path, self.rows)
 
-        def write(part: Path) -> None:
-            with part.open("w", newline="", encoding="utf-8") as file:
-                names = [item.name for item in dataclasses.fields(Row)]
-                writer = csv.DictWriter(file, names, lineterminator="\n")
-                writer.writeheader()
-                writer.writerows(dataclasses.asdict(row) for row in self.rows)
 
-        write_beside(self.path, write)
+def write_rows(path: Path, rows: Iterable[Row]) -> None:
+    """Rows as a CSV that `Store` reads.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+
+    def write(part: Path) -> None:
+        with part.open("w", newline="", encoding="utf-8") as file:
+            names = [item.name for item in dataclasses.fields(Row)]
+            writer = csv.DictWriter(file, names, lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(dataclasses.asdict(row) for row in rows)
+
+    write_beside(path, write)
 
 
 def configuration(**what: Any) -> str:

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from ..metrics import Estimate, mean_and_error
-from .store import Row
+from .store import ALL, Row
 
 __all__ = [
     "BASELINE",
@@ -46,6 +46,8 @@ class Cell:
     scene: str
     method: str
     time: float
+    unit: str
+    light: str
     seeds: int
     chosen: str
     """What drew last, of all seeds."""
@@ -57,11 +59,12 @@ class Cell:
     nonzero_share: float | None
     own_variance: Estimate | None
     reference_variance: float
-    elapsed: float
+    spent: float
+    """Seconds used, or samples per pixel."""
     work: Estimate
-    """relMSE × seconds used."""
+    """relMSE × what was spent."""
     variance_time: Estimate | None
-    """Relative variance, by the image itself, × seconds used."""
+    """Relative variance, by the image itself, × what was spent."""
     gain: Estimate | None
     """Variance per path, by the images' own."""
     cost: Estimate | None
@@ -70,11 +73,16 @@ class Cell:
     equal_time: Estimate | None
 
     @property
+    def gained(self) -> Estimate | None:
+        """The ratio at equal budget: time, or samples."""
+        return self.equal_time if self.unit == "s" else self.equal_samples
+
+    @property
     def verdict(self) -> str:
         """`win` or `loss` beyond two standard errors, `tie`, or nothing where there is nothing to compare."""
-        if self.method == BASELINE or self.equal_time is None:
+        if self.method == BASELINE or self.gained is None:
             return ""
-        ratio, error = self.equal_time
+        ratio, error = self.gained
         if not math.isfinite(error):
             return "one seed"
         if ratio - SIGNIFICANT * error > 1.0:
@@ -115,6 +123,8 @@ def cells(rows: Iterable[Row]) -> list[Cell]:
                 scene=scene,
                 method=method,
                 time=time,
+                unit=group[0].unit,
+                light=group[0].light,
                 seeds=len(group),
                 chosen="/".join(sorted({row.chosen for row in group})),
                 spp=sum(row.spp for row in group) / len(group),
@@ -125,10 +135,10 @@ def cells(rows: Iterable[Row]) -> list[Cell]:
                 nonzero_share=sum(shares) / len(shares) if shares else None,
                 own_variance=mean_and_error(known) if whole else None,
                 reference_variance=group[-1].reference_variance,
-                elapsed=sum(row.elapsed for row in group) / len(group),
-                work=mean_and_error([row.relmse * row.elapsed for row in group]),
+                spent=sum(row.spent for row in group) / len(group),
+                work=mean_and_error([row.relmse * row.spent for row in group]),
                 variance_time=mean_and_error(
-                    [v * row.elapsed for v, row in zip(known, group, strict=True)]
+                    [v * row.spent for v, row in zip(known, group, strict=True)]
                 )
                 if whole
                 else None,
@@ -173,7 +183,7 @@ class Overall:
     time: float
     scenes: int
     mean: Estimate
-    """Geometric mean of the ratios at equal time."""
+    """Geometric mean of the ratios at equal budget."""
     gain: Estimate | None
     """The same of the variance per path."""
     wins: int
@@ -187,8 +197,8 @@ def overall(found: Sequence[Cell]) -> list[Overall]:
     """All methods but the baseline, in the order of the cells."""
     groups: dict[tuple[str, float], list[tuple[Cell, Estimate]]] = {}
     for cell in found:
-        if cell.method != BASELINE and cell.equal_time is not None:
-            groups.setdefault((cell.method, cell.time), []).append((cell, cell.equal_time))
+        if cell.method != BASELINE and cell.gained is not None:
+            groups.setdefault((cell.method, cell.time), []).append((cell, cell.gained))
     result = []
     for (method, time), group in groups.items():
         verdicts = [cell.verdict for cell, _ in group]
@@ -270,16 +280,17 @@ class Reach:
     target: float
     """relMSE, mean over seeds."""
     seconds: float | None
-    """Interpolated between two measured times; None where it lies outside of them."""
+    """Or samples per pixel; interpolated between two measured ones, None where it lies outside of them."""
     bound: str = ""
     """What is known where there is no number: `< 1 s`, `> 30 s`, or `below the noise`."""
+    unit: str = "s"
 
     def __str__(self) -> str:
-        return self.bound if self.seconds is None else f"{self.seconds:.3g} s"
+        return self.bound if self.seconds is None else f"{self.seconds:.3g} {self.unit}"
 
 
 def time_to_reach(
-    points: Sequence[tuple[float, float]], target: float, floor: float
+    points: Sequence[tuple[float, float]], target: float, floor: float, unit: str = "s"
 ) -> tuple[float | None, str]:
     """Seconds at which an error that falls through `points` (seconds, error) first comes to `target`.
 
@@ -299,16 +310,16 @@ def time_to_reach(
         if error <= target:
             if before is None:
                 # A measured hit is a hit; one below it came sooner than anything that was measured.
-                return (seconds, "") if error == target else (None, f"< {seconds:.3g} s")
+                return (seconds, "") if error == target else (None, f"< {seconds:.3g} {unit}")
             # Below the floor an error is not known, only that it is no larger: the crossing is drawn to the floor.
             x0, y0 = before
             y1 = max(error, floor)
             if y1 <= 0.0:
-                return None, f"< {seconds:.3g} s"
+                return None, f"< {seconds:.3g} {unit}"
             share = 1.0 if y0 == y1 else math.log(y0 / target) / math.log(y0 / y1)
             return x0 * (seconds / x0) ** min(share, 1.0), ""
         before = seconds, error
-    return None, f"> {points[-1][0]:.3g} s"
+    return None, f"> {points[-1][0]:.3g} {unit}"
 
 
 def targets(found: Sequence[Cell], scene: str) -> list[float]:
@@ -329,13 +340,18 @@ def _rounded_up(value: float, digits: int = 2) -> float:
 
 
 def reaches(found: Sequence[Cell], most: int = 3) -> list[Reach]:
-    """The time of each method to the scene's last few targets."""
+    """The time, or the samples, of each method to the scene's last few targets."""
     result = []
+    found = [
+        cell for cell in found if cell.light != ALL
+    ]  # alone in its scene: compared with nobody
     for scene in dict.fromkeys(cell.scene for cell in found):
         own = [cell for cell in found if cell.scene == scene]
         for method in dict.fromkeys(cell.method for cell in own):
-            points = [(c.elapsed, c.relmse.value) for c in own if c.method == method]
+            points = [(c.spent, c.relmse.value) for c in own if c.method == method]
             for target in targets(found, scene)[-most:]:
                 floor = own[-1].reference_variance
-                result.append(Reach(scene, method, target, *time_to_reach(points, target, floor)))
+                unit = own[-1].unit
+                reached = time_to_reach(points, target, floor, unit)
+                result.append(Reach(scene, method, target, *reached, unit))
     return result

@@ -164,7 +164,7 @@ def _strip(
     found: dict[str, Finding],
 ) -> None:
     """Truth, random numbers and guides of a case's first setting, one seed each."""
-    from ..charts import strip
+    from ..verdicts import strip
 
     bench = next(iter(benches.values()))
     truth = bench.truth.mean(axis=0)

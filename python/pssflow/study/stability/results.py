@@ -14,8 +14,8 @@ from rich.table import Table
 from ... import _core
 from ...files import first_line, write_beside
 from ...report import markdown_table
-from ..charts import VERDICT_COLOURS, verdict_chart
 from ..store import commit, processor
+from ..verdicts import VERDICT_COLOURS, verdict_chart
 from .case import Case, Effort, Finding
 
 __all__ = ["Row", "Rows", "publish"]
