@@ -56,7 +56,7 @@ class SceneNames(Text):
 @click.option(
     "--full",
     is_flag=True,
-    help="The experiments in all parametrisations, not only for BSDF numbers.",
+    help="All experiments in all parametrisations, not only for BSDF numbers.",
 )
 @click.option("-o", "--output", default="out/study-thesis", show_default=True, metavar="DIR")
 @click.option("-q", "--quiet", is_flag=True, help="No progress, no notices.")
@@ -109,9 +109,8 @@ def thesis(
         known = thesis_of(plan.name)
         # What differs from the thesis is asked where it says what it found.
         if (known is not None and known.per_ray) or len(plans) == 1:
-            asked = runs.parametrisations if full else runs.parametrisations[:1]
             findings.experiments[plan.name] = experiments(
-                plan, scene, parts, asked, seed=seed, pixels=pixels
+                plan, scene, parts, runs.parametrisations, full=full, seed=seed, pixels=pixels
             )
             findings.losses[plan.name] = overfitting(
                 scene, parts, runs.parametrisations[0], seed=seed

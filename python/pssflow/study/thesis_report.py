@@ -11,6 +11,7 @@ from typing import Any
 
 from .. import _core
 from ..files import write_beside
+from ..metrics import finite_or_none
 from ..output import write_json
 from ..reference import read_exr
 from ..report import count, number, percent, scene_title
@@ -146,7 +147,7 @@ def _table_2(findings: Findings) -> Sheet:
 def _ratios(findings: Findings) -> Sheet:
     headings = (
         *("scene", "direction", "share random → learned", "thesis"),
-        *("found per ray", "non-zero per ray", "thesis"),
+        *("found per ray", "thesis", "non-zero per ray", "thesis"),
     )
     rows = []
     for runs in findings.scenes:
@@ -163,6 +164,10 @@ def _ratios(findings: Findings) -> Sheet:
                     f"{percent(random['nonzero_share'])} → {percent(learned['nonzero_share'])}",
                     "" if shares is None else f"{shares[0]:.2f} % → {shares[1]:.2f} %",
                     f"{found:.2f}",
+                    # Its two figures say it: per ray = found per ray × share.
+                    ""
+                    if shares is None or per_ray is None
+                    else f"{per_ray * shares[0] / shares[1]:.2f}",
                     f"{runs.ratio(parametrisation):.2f}",
                     "" if per_ray is None else f"{per_ray:.1f}",
                 ]
@@ -230,7 +235,7 @@ def _experiments(findings: Findings) -> list[Sheet]:
             percent(f.value["random_share"]),
             percent(f.value["mass_outside"]),
             number(f.value["loss"], 3),
-            number(_over(f.value["random_variance"] or math.nan, f.value["variance"] or 0.0), 3),
+            number(finite_or_none(_over(f.value["random_variance"], f.value["variance"])), 3),
         ]
         for scene, found in findings.experiments.items()
         for f in found
@@ -291,7 +296,7 @@ def _phases(findings: Findings) -> Sheet:
                         *(f"{run.stats['seconds'][phase]:.2f}" for phase in PHASES),
                         count(sum(part["spp"] for part in run.stats["passes"])),
                         number(run.stats["relmse"], 3),
-                        number(gain, 3) if kind == "learned" else "",
+                        number(finite_or_none(gain), 3) if kind == "learned" else "",
                     ]
                 )
     title = (
@@ -334,9 +339,9 @@ def _told(found: Sequence[Found], theirs: float) -> str:
     outside, loss = base.value["mass_outside"], base.value["loss"]
     above = "above 0, so it describes light-carrying paths worse than uniform numbers do"
     verdict = (
-        f"“{best.experiment.name}” alone would explain it"
+        f"“{best.experiment.name}” alone would explain it: {best.experiment.tells}"
         if best.ratio >= 0.9 * theirs
-        else "so that none of them alone explains it"
+        else "none of them alone explains it"
     )
     return (
         f"What raises it: {what}; {verdict}. {percent(outside)} of the flow's samples fall outside the cube and find "
@@ -361,11 +366,7 @@ def _overfit(findings: Findings) -> list[str]:
                 f"{number(last['training'], 3)})"
             )
             told.append(f"with {count(own[0]['trained_on'])} paths the held-out loss {word}")
-        lines.append(
-            f"overfitting, {scene_title(scene)}: {'; '.join(told)}. The thesis' 7 epochs end before it."
-            if told
-            else f"overfitting, {scene_title(scene)}: too few paths"
-        )
+        lines.append(f"overfitting, {scene_title(scene)}: {'; '.join(told) or 'too few paths'}")
     return lines
 
 
