@@ -78,7 +78,8 @@ def thesis(
     """
     from .parts import Parts
     from .sceneries import named_scenes
-    from .thesis_report import Findings, publish
+    from .thesis_findings import Findings
+    from .thesis_report import publish
     from .thesis_scene import MOST_PIXELS, open_scene, render_runs, thesis_of
     from .thesis_tests import crescents, experiments, overfitting
 
