@@ -18,7 +18,7 @@ from pssflow.reference import reference
 from pssflow.study import harness, report
 from pssflow.study.harness import Scenery
 from pssflow.study.methods import _counted, named_method
-from pssflow.study.report import publish
+from pssflow.study.report import publish, with_error
 from pssflow.study.results import document
 from pssflow.study.store import ALL, Store
 from pssflow.study.summary import cells, choices, overall, reaches
@@ -257,12 +257,15 @@ def test_results_say_wins_and_losses_and_how_they_were_measured(tmp_path, capfd)
         assert told in text
     assert rows[0].processor in text
     assert "win |" in text
+    floor = done.floors()["scene 0", "none"]
+    assert with_error(floor) in text.partition("## References")[2]
     assert "loss |" in text
     assert Store(target.with_suffix(".csv")).rows == rows
     # From its own CSV alone the same, but for what the images say.
     again = document(Store(target.with_suffix(".csv")).rows, tmp_path / "nowhere", "results.csv")
     assert "Bias was not tested" in again
-    assert again.partition("## Errors")[2] == text.partition("## Errors")[2]
+    errors = [t.partition("## Errors")[2].partition("## References")[0] for t in (again, text)]
+    assert errors[0] == errors[1]
 
 
 def test_results_take_the_newest_settings_only(tmp_path, capfd):

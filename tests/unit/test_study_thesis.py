@@ -118,6 +118,15 @@ def test_side_by_side_keeps_the_order_and_stops_the_others():
     assert stopped in ([], [True])  # never begun on one core, told on two
 
 
+def test_a_fit_ends_when_it_is_told():
+    """What Ctrl-C comes to in the threads beside the one that gets it."""
+    stop = threading.Event()
+    stop.set()
+    u = np.random.default_rng(0).random((512, 2), np.float32)
+    with pytest.raises(RuntimeError, match="fit was stopped at"):
+        Guide.fit("realnvp", u, np.ones(512, np.float32), progress=thesis_tests._until(stop))
+
+
 def test_experiments_change_what_they_say(llvm_variant, monkeypatch):
     """The lamp's area by the square of the factor; a second emitter at the camera; the rest of the scene as it was."""
     monkeypatch.chdir(ROOT)

@@ -147,7 +147,6 @@ def ratio_chart(
                 axes.axhspan(row - 0.5, row + 0.5, color="#f2f2f2", zorder=0)
         axes.axhline(len(scenes) - 0.5, color=MUTED, linewidth=1)
         axes.set_xscale("log")
-        plain_ticks(axes.xaxis)
         axes.set_ylim(len(labels) - 0.5, -0.5)
         axes.set_yticks(range(len(labels)), labels)
         axes.tick_params(axis="y", length=0, labelleft=i == 0)
@@ -159,6 +158,9 @@ def ratio_chart(
         )
         axes.grid(axis="x", which="both", color="#dddddd", linewidth=0.5)
         axes.set_axisbelow(True)
+    # All panels share their axis, whose ends are known only now.
+    for axes in figure.axes:
+        plain_ticks(axes.xaxis)
     return finish(figure, path, title, _legend_handles(others, methods), caption)
 
 

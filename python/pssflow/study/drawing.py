@@ -6,6 +6,7 @@ read, too. Every chart is written as PNG and as SVG.
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,10 +23,16 @@ MUTED = "#666666"
 
 
 def plain_ticks(axis: Any) -> None:
-    """1, 3, 10 in place of 10⁰, 10¹: decades alone leave most of these axes without a number."""
+    """1, 2, 5, 10 in place of 10⁰, 10¹: decades alone leave most of these axes without a number.
+
+    Of an axis whose data are drawn; over more than two decades 1 and 3 are enough, over more than four 1.
+    """
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-    axis.set_major_locator(LogLocator(10, subs=(1.0, 2.0, 5.0), numticks=12))
+    low, high = axis.get_view_interval()
+    decades = math.log10(high / low) if 0.0 < low < high else 1.0
+    subs = (1.0, 2.0, 5.0) if decades <= 2.0 else (1.0, 3.0) if decades <= 4.0 else (1.0,)
+    axis.set_major_locator(LogLocator(10, subs=subs, numticks=12))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
 

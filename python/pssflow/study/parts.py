@@ -6,7 +6,10 @@ A part's value is JSON in a file of its own, beside the hash of all that decides
 from __future__ import annotations
 
 import json
+import math
 import os
+import threading
+import time
 from collections.abc import Callable, Iterable, Mapping
 from datetime import datetime, timezone
 from pathlib import Path
@@ -35,6 +38,25 @@ class Parts:
         self.folder = make_folder(folder)
         self.say = say
         self.common = common
+        self._lock = threading.Lock()  # parts may be done side by side
+        self._expected = self._met = self._done = 0
+        self._start = 0.0
+
+    def expect(self, parts: int) -> None:
+        """Tells that so many more parts are to come, for the time left."""
+        self._expected += parts
+
+    def _told(self, name: str) -> str:
+        """A part that begins: which one it is, and how long the rest will take by those that were done."""
+        with self._lock:
+            now = time.monotonic()
+            self._start = self._start or now
+            place = f"[{self._met}/{max(self._expected, self._met)}] " if self._expected else ""
+            left = ""
+            if self._done and self._expected > self._met:
+                each = (now - self._start) / self._done
+                left = f"; about {math.ceil(each * (self._expected - self._met + 1) / 60)} min left"
+            return f"{place}{name}{left}"
 
     def __call__(
         self,
@@ -54,10 +76,12 @@ class Parts:
         """
         path = self.folder / f"{file_name(name)}.json"
         key = configuration(part=name, **self.common, **decides)
+        with self._lock:
+            self._met += 1
         kept = _read(path)
         if kept.get("configuration") == key and all(file.is_file() for file in files):
             return kept["value"]
-        self.say(name)
+        self.say(self._told(name))
         before = os.getloadavg()[0]
         value = plain(make())
         value["ran"] = {
@@ -67,6 +91,8 @@ class Parts:
             "load_after": os.getloadavg()[0],
         }
         write_json(path, {"configuration": key, "value": value})
+        with self._lock:
+            self._done += 1
         return value
 
 

@@ -254,10 +254,10 @@ def _charts(
             continue
         heading = heading.replace("time", "samples") if study.unit == "spp" else heading
         noise = "" if measure in NOISY else " It holds the reference’s noise."
-        bands = "lines are means over seeds, bands reach from the least to the largest. "
+        bands = "Lines are means over seeds, bands reach from the least to the largest. "
         bands = bands if len(study.seeds) > 1 else ""
-        used = "points lie at the seconds really used." if study.unit == "s" else ""
-        caption = f"{where}; {bands}{used}{noise}"
+        used = "Points lie at the seconds really used." if study.unit == "s" else ""
+        caption = f"{where}. {bands}{used}{noise}"
         path = study.folder / f"{name}.png"
         heading = f"{heading}: {title}"
         error_chart(path, heading, rows, methods, measure=measure, label=label, caption=caption)

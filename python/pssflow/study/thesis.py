@@ -56,7 +56,7 @@ class SceneNames(Text):
 @click.option(
     "--full",
     is_flag=True,
-    help="The experiments in all parametrisations, not only for BSDF numbers.",
+    help="All experiments in all parametrisations, not only for BSDF numbers.",
 )
 @click.option("-o", "--output", default="out/study-thesis", show_default=True, metavar="DIR")
 @click.option("-q", "--quiet", is_flag=True, help="No progress, no notices.")
@@ -78,7 +78,8 @@ def thesis(
     """
     from .parts import Parts
     from .sceneries import named_scenes
-    from .thesis_report import Findings, publish
+    from .thesis_findings import Findings
+    from .thesis_report import publish
     from .thesis_scene import MOST_PIXELS, open_scene, render_runs, thesis_of
     from .thesis_tests import crescents, experiments, overfitting
 
@@ -109,9 +110,8 @@ def thesis(
         known = thesis_of(plan.name)
         # What differs from the thesis is asked where it says what it found.
         if (known is not None and known.per_ray) or len(plans) == 1:
-            asked = runs.parametrisations if full else runs.parametrisations[:1]
             findings.experiments[plan.name] = experiments(
-                plan, scene, parts, asked, seed=seed, pixels=pixels
+                plan, scene, parts, runs.parametrisations, full=full, seed=seed, pixels=pixels
             )
             findings.losses[plan.name] = overfitting(
                 scene, parts, runs.parametrisations[0], seed=seed

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import csv
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from .. import _core
 from ..files import write_beside
+from ..metrics import finite_or_none
 from ..output import write_json
 from ..reference import read_exr
 from ..report import count, number, percent, scene_title
@@ -25,10 +24,11 @@ from .thesis_charts import (
     phase_chart,
     render_picture,
 )
+from .thesis_findings import Findings, differs, failing_prior, over, overfit
 from .thesis_scene import PHASES, ThesisRun, ThesisRuns
 from .thesis_tests import Found
 
-__all__ = ["Findings", "publish"]
+__all__ = ["publish"]
 
 NOTES = f"""\
 Preset `thesis`: next-event estimation alone; 16 spp of random numbers teach and are discarded, 16 spp are drawn from
@@ -40,21 +40,6 @@ share changes, not its level. s: pilot, training, rendering. relMSE: against Mit
 of the reference about each pixel, the reference's own variance subtracted; the thesis has no such number. “trimmed”
 leaves out the worst 0.1 % of the pixels. The thesis says that its network has {count(PARAMETERS)} parameters; what it
 describes has the number in Table 1."""
-
-
-@dataclass
-class Findings:
-    """All that was done so far."""
-
-    folder: Path
-    seed: int
-    crescents: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    """By prior."""
-    scenes: list[ThesisRuns] = field(default_factory=list)
-    experiments: dict[str, Sequence[Found]] = field(default_factory=dict)
-    """By scene."""
-    losses: dict[str, Sequence[Mapping[str, Any]]] = field(default_factory=dict)
-    """By scene."""
 
 
 def publish(findings: Findings, seconds: float) -> list[Any]:
@@ -80,7 +65,7 @@ def publish(findings: Findings, seconds: float) -> list[Any]:
         _fireflies(findings),
         _phases(findings),
     ]
-    lines = [*_differs(findings), *_overfit(findings), *_prior(findings)]
+    lines = [*differs(findings), *overfit(findings), *failing_prior(findings)]
     lines += [f"{runs.name}: {runs.thesis.caption}" for runs in findings.scenes if runs.thesis]
     lines += [f"reference of {runs.name}: {runs.truth.note}" for runs in findings.scenes]
     ran = [run.stats["ran"] for runs in findings.scenes for run in runs.runs]
@@ -146,7 +131,7 @@ def _table_2(findings: Findings) -> Sheet:
 def _ratios(findings: Findings) -> Sheet:
     headings = (
         *("scene", "direction", "share random → learned", "thesis"),
-        *("found per ray", "non-zero per ray", "thesis"),
+        *("found per ray", "thesis", "non-zero per ray", "thesis"),
     )
     rows = []
     for runs in findings.scenes:
@@ -155,7 +140,7 @@ def _ratios(findings: Findings) -> Sheet:
             random, learned = own["random"].stats, own["learned"].stats
             shares = None if runs.thesis is None else runs.thesis.shares.get(parametrisation)
             per_ray = None if runs.thesis is None else runs.thesis.per_ray.get(parametrisation)
-            found = _over(_found(learned), _found(random))
+            found = over(_found(learned), _found(random))
             rows.append(
                 [
                     scene_title(runs.name),
@@ -163,6 +148,10 @@ def _ratios(findings: Findings) -> Sheet:
                     f"{percent(random['nonzero_share'])} → {percent(learned['nonzero_share'])}",
                     "" if shares is None else f"{shares[0]:.2f} % → {shares[1]:.2f} %",
                     f"{found:.2f}",
+                    # Its two figures say it: per ray = found per ray × share.
+                    ""
+                    if shares is None or per_ray is None
+                    else f"{per_ray * shares[0] / shares[1]:.2f}",
                     f"{runs.ratio(parametrisation):.2f}",
                     "" if per_ray is None else f"{per_ray:.1f}",
                 ]
@@ -225,12 +214,12 @@ def _experiments(findings: Findings) -> list[Sheet]:
             f.experiment.name,
             f.experiment.tells,
             f"{f.ratio:.2f}",
-            f"{_over(f.value['found_per_ray'], f.value['random_found_per_ray']):.2f}",
+            f"{over(f.value['found_per_ray'], f.value['random_found_per_ray']):.2f}",
             percent(f.value["share"]),
             percent(f.value["random_share"]),
             percent(f.value["mass_outside"]),
             number(f.value["loss"], 3),
-            number(_over(f.value["random_variance"] or math.nan, f.value["variance"] or 0.0), 3),
+            number(finite_or_none(over(f.value["random_variance"], f.value["variance"])), 3),
         ]
         for scene, found in findings.experiments.items()
         for f in found
@@ -264,7 +253,7 @@ def _fireflies(findings: Findings) -> Sheet:
                     number(stats["firefly"]["brightest"], 3),
                     number(stats["max_contribution"], 3),
                     number(stats["max_weight"], 3),
-                    percent(_over(stats["ess"] or 0.0, stats["camera_rays"])),
+                    percent(over(stats["ess"] or 0.0, stats["camera_rays"])),
                 ]
             )
     title = "Fireflies: pixels ten times as bright as the reference about them"
@@ -282,7 +271,7 @@ def _phases(findings: Findings) -> Sheet:
             own = runs.of(parametrisation)
             for kind in ("learned", "random-time"):
                 run = own[kind]
-                gain = _over(own["random-time"].stats["relmse"], own["learned"].stats["relmse"])
+                gain = over(own["random-time"].stats["relmse"], own["learned"].stats["relmse"])
                 rows.append(
                     [
                         scene_title(runs.name),
@@ -291,92 +280,13 @@ def _phases(findings: Findings) -> Sheet:
                         *(f"{run.stats['seconds'][phase]:.2f}" for phase in PHASES),
                         count(sum(part["spp"] for part in run.stats["passes"])),
                         number(run.stats["relmse"], 3),
-                        number(gain, 3) if kind == "learned" else "",
+                        number(finite_or_none(gain), 3) if kind == "learned" else "",
                     ]
                 )
     title = (
         "Time by phase beside random sampling for the same time (below 1: the thesis' method loses)"
     )
     return Sheet(title, headings, rows, texts=3)
-
-
-def _differs(findings: Findings) -> list[str]:
-    """Whether our ratio is the thesis', and what the experiments say about it."""
-    lines = []
-    for runs in findings.scenes:
-        found = findings.experiments.get(runs.name, ())
-        for parametrisation, theirs in (runs.thesis.per_ray if runs.thesis else {}).items():
-            if parametrisation not in runs.parametrisations:
-                continue
-            ours = runs.ratio(parametrisation)
-            text = (
-                f"{scene_title(runs.name)}, {parametrisation}: {ours:.2f} times as many non-zero paths per camera ray "
-                f"as random numbers find; the thesis has {theirs:.1f}"
-            )
-            own = [f for f in found if f.parametrisation == parametrisation and f.ratio > 0.0]
-            if abs(ours - theirs) > 0.1 * theirs and own:
-                text += f". {_told(own, theirs)}"
-            lines.append(text)
-    return lines
-
-
-def _told(found: Sequence[Found], theirs: float) -> str:
-    """What the experiments rule out, in words."""
-    base = next((f for f in found if f.experiment.name == "as in the thesis"), found[0])
-    best = max(found, key=lambda f: f.ratio)
-    moved = [f for f in found if f is not base and f.ratio > 1.1 * base.ratio]
-    what = (
-        "; ".join(f"{f.experiment.name}: {f.ratio:.2f}" for f in moved)
-        if moved
-        else "none of the changes tried raises it by a tenth"
-    )
-    reach = base.value["surfaces"] / max(base.value["random_per_ray"], 1e-12)
-    outside, loss = base.value["mass_outside"], base.value["loss"]
-    above = "above 0, so it describes light-carrying paths worse than uniform numbers do"
-    verdict = (
-        f"“{best.experiment.name}” alone would explain it"
-        if best.ratio >= 0.9 * theirs
-        else "so that none of them alone explains it"
-    )
-    return (
-        f"What raises it: {what}; {verdict}. {percent(outside)} of the flow's samples fall outside the cube and find "
-        f"nothing; its held-out loss is {number(loss, 3)}{', ' + above if loss and loss > 0.0 else ''}. No guide that "
-        f"leaves the camera alone could pass {reach:.0f}, one path for each camera ray that meets a surface"
-    )
-
-
-def _overfit(findings: Findings) -> list[str]:
-    lines = []
-    for scene, fits in findings.losses.items():
-        told = []
-        for rows in dict.fromkeys(f["rows"] for f in fits if f["of"] == "paths"):
-            own = [f for f in fits if (f["of"], f["rows"]) == ("paths", rows)]
-            best, last = min(own, key=lambda f: f["held_out"]), own[-1]
-            word = (
-                f"rises again after {best['epochs']} epochs ({number(best['held_out'], 3)} → "
-                f"{number(last['held_out'], 3)} at {last['epochs']}, while the training loss falls to "
-                f"{number(last['training'], 3)})"
-                if best is not last
-                else f"still falls at {last['epochs']} epochs ({number(last['held_out'], 3)}; training "
-                f"{number(last['training'], 3)})"
-            )
-            told.append(f"with {count(own[0]['trained_on'])} paths the held-out loss {word}")
-        lines.append(
-            f"overfitting, {scene_title(scene)}: {'; '.join(told)}. The thesis' 7 epochs end before it."
-            if told
-            else f"overfitting, {scene_title(scene)}: too few paths"
-        )
-    return lines
-
-
-def _prior(findings: Findings) -> list[str]:
-    lost = findings.crescents["hypercube"]["lost"]
-    text = (
-        f"hypercube prior: after training {percent(lost)} of the crescent's own numbers have density 0. A path that "
-        "the flow maps outside the hypercube has likelihood 0 and no gradient; the others are told to spread, which "
-        "maximum likelihood rewards until they have left it, too. A Gaussian has a gradient everywhere"
-    )
-    return [text]
 
 
 def _charts(findings: Findings) -> list[Chart]:
@@ -510,10 +420,3 @@ def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 def _found(stats: Mapping[str, Any]) -> float:
     return stats["paths_found"] / max(stats["camera_rays"], 1)
-
-
-def _over(numerator: float | None, denominator: float | None) -> float:
-    """A ratio; NaN where there is none."""
-    if numerator is None or not denominator:
-        return math.nan
-    return numerator / denominator

@@ -147,6 +147,7 @@ def render_runs(
     thesis = thesis_of(plan.name)
     parametrisations = list(thesis.shares) if thesis is not None else ["bsdf"]
     place = folder / "images" / f"{file_name(plan.name)}-reference.exr"
+    parts.expect(1 + len(parametrisations) * len(KINDS))
 
     def truth() -> dict[str, Any]:
         found = reference(scene, 2, seconds=reference_time, progress=progress)

@@ -43,10 +43,12 @@ class Experiment:
     """Factor on the radius of the disk light."""
     point_light: bool = False
     """Whether the point light of PBRT's file is there, at the camera, of intensity 50."""
+    everywhere: bool = False
+    """Whether it is made for all parametrisations: those that tell most."""
 
 
 EXPERIMENTS = (
-    Experiment("as in the thesis", "the row of Table 2, with a pilot of its own"),
+    Experiment("as in the thesis", "the row of Table 2, with a pilot of its own", everywhere=True),
     Experiment("4 × the epochs", "training stopped too early", options={"epochs": 28}),
     Experiment("4 × the pilot", "too few paths to learn from", pilot_spp=4 * SPP),
     Experiment(
@@ -60,7 +62,12 @@ EXPERIMENTS = (
         options={"s_max": 4.0},
     ),
     Experiment("no resampling", "resampling by radiance favours bright paths", alike=True),
-    Experiment("through a logit", "samples that fall outside the cube", guide="realnvp-logit"),
+    Experiment(
+        "through a logit",
+        "samples that fall outside the cube",
+        guide="realnvp-logit",
+        everywhere=True,
+    ),
     Experiment(
         "through a logit, 4 × the pilot",
         "both of them",
@@ -72,6 +79,7 @@ EXPERIMENTS = (
         "one density for all pixels (Zheng and Zwicker's know theirs)",
         guide="realnvp-logit",
         options={"condition": "pixel"},
+        everywhere=True,
     ),
     Experiment("hypercube prior", "the thesis' failing prior", options={"prior": "hypercube"}),
     Experiment("lamp of half the radius", "the light's size", lamp=0.5),
@@ -101,12 +109,22 @@ def experiments(
     parts: Parts,
     parametrisations: Sequence[str],
     *,
+    full: bool,
     seed: int,
     pixels: int,
 ) -> list[Found]:
-    """All experiments that the scene allows: lights are changed only where there is a disk to change."""
+    """All experiments that the scene allows: lights are changed only where there is a disk to change.
+
+    In all parametrisations if `full`, else in the first one and a few of them in the others.
+    """
     wanted = [e for e in EXPERIMENTS if _is_plain(e) or _disk(scene) is not None]
-    cases = [(e, p) for p in parametrisations for e in wanted]
+    cases = [
+        (e, p)
+        for p in parametrisations
+        for e in wanted
+        if full or e.everywhere or p == parametrisations[0]
+    ]
+    parts.expect(len(cases))
     # Lights change the scene: those are built here, once, since Mitsuba's variants belong to one thread.
     scenes = {_light(e): scene if _is_plain(e) else _changed(plan, pixels, e) for e in wanted}
     common = {"seed": seed, "hash": scene.hash, "pixels": pixels}
@@ -247,10 +265,12 @@ def overfitting(
         )
 
     common = {"scene": scene.hash, "seed": seed, "on": parametrisation}
+    parts.expect(1)
     lit = parts(f"{scene.name} paths with light", lambda: {"paths": len(drawn()[0].u)}, **common)
     fits = [{"of": of, "hidden": 40, **fit} for of, list_ in LEARNING.items() for fit in list_]
     # A scene of few paths has fewer to learn from than the largest set asks for.
     fits = [fit for fit in fits if fit["rows"] <= max(lit["paths"], 1024)]
+    parts.expect(len(fits))
 
     def work(fit: dict[str, Any], stop: threading.Event) -> dict[str, Any]:
         def make() -> dict[str, Any]:
@@ -285,6 +305,7 @@ def crescents(parts: Parts, seed: int) -> dict[str, dict[str, Any]]:
         )
 
     priors = ["gaussian", "hypercube"]
+    parts.expect(len(priors))
     return dict(zip(priors, side_by_side(work, priors), strict=True))
 
 
