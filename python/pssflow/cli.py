@@ -33,7 +33,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 RECORDED = (
     *("--guide", "--load-guide", "--preset", "--spp", "--time", "--pilot-spp", "--keep-pilot"),
-    *("--k", "--max-depth", "--parametrisation", "--emitter-strategy", "--uniform-fraction", "--seed", "--set"),
+    *(
+        "--k",
+        "--max-depth",
+        "--parametrisation",
+        "--emitter-strategy",
+        "--uniform-fraction",
+        "--seed",
+        "--set",
+    ),
 )
 """What a record says itself, and cannot be given beside `--replay`."""
 
@@ -206,9 +214,15 @@ def render(
     for other in RECORDED:
         _exclude(given, "--replay", other)
     _exclude(options, "--spp", "--time")
-    for other, value in (("--k", options["k"]), ("--load-guide", load_guide), ("--save-guide", save_guide)):
+    for other, value in (
+        ("--k", options["k"]),
+        ("--load-guide", load_guide),
+        ("--save-guide", save_guide),
+    ):
         if options["max_depth"] is not None and value is not None:
-            raise click.UsageError(f"{other} is for light of one k, and was given beside --max-depth")
+            raise click.UsageError(
+                f"{other} is for light of one k, and was given beside --max-depth"
+            )
     target = _exr(output)
     record_target = target.with_suffix(".json")
     for path in (record_target, save_guide):

@@ -11,7 +11,8 @@ by Mitsuba's own ray tracing, and
 derivative is unbiased for every parameter that moves no geometry, whatever the guide, since m ≥ a > 0. What moves
 geometry is refused by name: its discontinuities need other estimators.
 
-Where a lobe is a delta its weight is a constant, as in Mitsuba's `prb`; parameters of such lobes are refused too.
+Where a lobe is a delta its weight is a constant, as in Mitsuba's `prb`; parameters of such lobes are refused too. Paths
+go on where a surface reflects nothing, since it has a derivative all the same; `prb` ends them there.
 Paths are drawn and differentiated a few samples at a time, so that memory does not grow with their number.
 """
 
@@ -96,6 +97,8 @@ def backward(
 ) -> None:
     """Propagates the gradient of an image (H, W, C) to the scene's parameters; see `forward`."""
     for image, share in _images(ours, result, sensor, seed, spp, parametrisation):
+        if not dr.grad_enabled(image):
+            continue  # light of this length does not depend on the parameters
         dr.set_grad(image, grad * share)
         dr.enqueue(dr.ADMode.Backward, image)
         dr.traverse(dr.ADMode.Backward)
@@ -117,7 +120,9 @@ def forward(
     """
     total = None
     for image, share in _images(ours, result, sensor, seed, spp, parametrisation):
-        dr.forward_to(image)
+        # The parameters' own gradients stay: later passes need them, too.
+        kept = dr.ADFlag.ClearEdges | dr.ADFlag.ClearInterior | dr.ADFlag.AllowNoGrad
+        dr.forward_to(image, flags=kept)
         part = dr.detach(dr.grad(image)) * share
         total = part if total is None else total + part
         dr.eval(total)
@@ -137,7 +142,9 @@ def _images(
     pixels = int(np.prod(np.array(film.crop_size())))
     most = max(MOST_AT_ONCE // pixels, 1)
     emitters = dr.gather(
-        mi.UInt32, mi.UInt32(ours.exported.emitter_order or [0]), dr.arange(mi.UInt32, max(len(ours.exported.emitter_order), 1))
+        mi.UInt32,
+        mi.UInt32(ours.exported.emitter_order or [0]),
+        dr.arange(mi.UInt32, max(len(ours.exported.emitter_order), 1)),
     )
     for k, guide, a, strategy in sources(result):
         for first in range(0, spp, most):
@@ -168,7 +175,7 @@ def _images(
 def radiance(
     scene: Any, sensor: Any, drawn: dict[str, Any], k: int, emitters: Any
 ) -> tuple[Any, Any]:
-    """f ÷ m of drawn paths with its graph, and where on the film they belong.
+    """F ÷ m of drawn paths with its graph, and where on the film they belong.
 
     Args:
         scene: Mitsuba's scene.
@@ -256,5 +263,3 @@ def _has_delta(bsdf: Any) -> bool:
     return bool(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)) or bool(
         mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
     )
-
-

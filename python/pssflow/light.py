@@ -135,7 +135,9 @@ def _by_budget(
     total = sum(part.cost for part in parts)
     done = 0.0
     for part in parts:
-        own = replace(plan, k=max(part.k, 0), emitter_strategy=part.strategy, seed=_seed(plan, part.k))
+        own = replace(
+            plan, k=max(part.k, 0), emitter_strategy=part.strategy, seed=_seed(plan, part.k)
+        )
         if plan.time is None:
             own = replace(own, spp=max(round(part.probe["spp"]), 1))
         else:
@@ -219,12 +221,12 @@ def _sum(
 ) -> Result:
     from .render import Result
 
-    image = np.sum([part.image for part in parts], axis=0, dtype=np.float32)
-    variance = np.sum([part.variance for part in parts], axis=0, dtype=np.float32)
-    found, nonzero = (
-        np.sum([getattr(part, name) for part in parts], axis=0, dtype=np.uint32)
-        for name in ("found", "nonzero")
-    )
+    def total(name: str) -> Any:
+        values = [getattr(part, name) for part in parts]
+        return np.sum(values, axis=0, dtype=values[0].dtype)
+
+    image, variance = total("image"), total("variance")
+    found, nonzero = total("found"), total("nonzero")
     stats = [part.stats for part in parts]
     timings = dict(scene.timings)
     for name in ("pilot", "fit", "render"):
@@ -239,8 +241,12 @@ def _sum(
     guided = [record for record in stats if record["chosen"] != "none"]
     heaviest = [record["max_contribution"] * _luminance(record["mean"]) for record in stats]
     brightness = _luminance(mean)
-    relative = metrics.relative_variance(variance, image) if image.any() else None
-    notes = [note for note in dict.fromkeys(n for r in stats for n in r["notes"]) if not _of_one(note)]
+    # One sample of a length has no variance.
+    known = image.any() and np.isfinite(variance).all()
+    relative = metrics.relative_variance(variance, image) if known else None
+    notes = [
+        note for note in dict.fromkeys(n for r in stats for n in r["notes"]) if not _of_one(note)
+    ]
     if not image.any():
         notes.append("the image is black: no path of any length carried light")
     record: dict[str, Any] = {
@@ -278,7 +284,9 @@ def _sum(
         "variant": scene.variant,
     }
     layers = {f"k{part.stats['k']}": part.image for part in parts}
-    whole = Result(image, variance, found, nonzero, record, timings, None, parts=tuple(parts), layers=layers)
+    whole = Result(
+        image, variance, found, nonzero, record, timings, None, parts=tuple(parts), layers=layers
+    )
     return replace(whole, layers=layers | {"nonzero_share": share_layer(whole)})
 
 
@@ -292,5 +300,3 @@ def _luminance(rgb: Any) -> float:
 def _of_one(note: str) -> bool:
     """Whether a note speaks of a part only: that there is no light of some length is no news."""
     return note.startswith("the image is black")
-
-

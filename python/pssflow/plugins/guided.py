@@ -30,8 +30,8 @@ Learned primary-sample-space importance sampling (:monosp:`pss_guided`)
    - Added to that of ``mi.render``. (Default: 0)
 
 A pilot is rendered with uniform numbers that are written down; a guide q learns where they were bright; the rest is
-drawn from the mixture m = a + (1 − a)·q and divided by it. That is unbiased for every guide, since m ≥ a > 0, as long as
-radiance is a function of the camera ray and of numbers that come from the sampler: an integrator that remembers
+drawn from the mixture m = a + (1 − a)·q and divided by it. That is unbiased for every guide, since m ≥ a > 0, as long
+as radiance is a function of the camera ray and of numbers that come from the sampler: an integrator that remembers
 earlier samples, or draws numbers of its own, breaks it. The pilot's samples count half. Film position and lens are
 never learned.
 
@@ -82,8 +82,8 @@ COLUMNS: dict[str, tuple[str, ...]] = {
     "DirectIntegrator": (*BOUNCE[:2], *BOUNCE[3:5], "lobe"),
     "BasicPRBIntegrator": BOUNCE[2:5],
 }
-"""What the numbers of a bounce decide, in the order in which LLVM variants draw them, by class. `DirectIntegrator` has one
-bounce. Integrators that are not here are guided as well; their columns have no names."""
+"""What the numbers of a bounce decide, in the order in which LLVM variants draw them, by class. `DirectIntegrator` has
+one bounce. Integrators that are not here are guided as well; their columns have no names."""
 
 SHARES = (0.1, 0.25, 0.5)
 """Shares of uniform paths that are tried."""
@@ -128,14 +128,14 @@ class _Candidate:
         # Guides ask for vertices, of which there are half as many as numbers; those of whole paths look at none.
         nowhere = np.zeros((len(u), (self.dimensions - 1) // 2, 3), np.float32)
         contexts = {"position": nowhere, "normal": nowhere, "outgoing": nowhere, "pixel": pixel}
-        options = {} if self.condition is None else {"condition": self.condition}
+        options: dict[str, Any] = {} if self.condition is None else {"condition": self.condition}
         return Guide.fit(
             self.name, u[:, : self.dimensions], np.abs(f), contexts=contexts, seed=seed, **options
         )
 
     @staticmethod
     def density(guide: Guide, u: F32, pixel: F32) -> NDArray[np.float64]:
-        """q of the numbers that the guide models; the others are uniform."""
+        """Q of the numbers that the guide models; the others are uniform."""
         log_q = guide.log_prob(u[:, : guide.dims], contexts={"pixel": pixel})
         return np.exp(log_q.astype(np.float64))
 
@@ -149,7 +149,7 @@ def define() -> Callable[[Any], Any]:
 
         def __init__(self, props: Any) -> None:
             super().__init__(props)
-            if "llvm" not in mi.variant():
+            if "llvm" not in str(mi.variant()):
                 raise ValueError(
                     f"integrator pss_guided: in {mi.variant()} lanes do not draw the same numbers; use llvm_ad_rgb"
                 )
@@ -207,7 +207,12 @@ def define() -> Callable[[Any], Any]:
         def to_string(self) -> str:
             """As Mitsuba prints its own."""
             inner = str(self.nested).replace("\n", "\n  ")
-            return f"GuidedIntegrator[\n  guide = {self.guide},\n  dimensions = {self.dimensions},\n  nested = {inner}\n]"
+            values = {"guide": self.guide, "dimensions": self.dimensions, "nested": inner}
+            return (
+                "GuidedIntegrator[\n"
+                + ",\n".join(f"  {k} = {v}" for k, v in values.items())
+                + "\n]"
+            )
 
         def _fill(self, scene: Any, camera: Any, block: Any, spp: int, bits: Any) -> None:
             """Pilot, guide, rest."""
@@ -240,7 +245,8 @@ def define() -> Callable[[Any], Any]:
                 "seconds": {"pilot": pilot_s, "fit": fit_s, "render": render_s},
             }
             gained = "" if gain is None else f", variance of a sample lower by {gain:.2f}"
-            mi.Log(mi.LogLevel.Info, f"pss_guided: {self.stats['chosen']} at a = {a:g}{gained}")
+            log: Any = mi.Log
+            log(mi.LogLevel.Info, f"pss_guided: {self.stats['chosen']} at a = {a:g}{gained}")
 
         def _passes(
             self,
@@ -396,7 +402,9 @@ def _nested(props: Any) -> Any:
     if not isinstance(nested, mi.SamplingIntegrator) or not hasattr(nested, "sample"):
         raise ValueError(f"{what} has no method `sample` that turns numbers into radiance")
     if any(base.__name__ == "PSIntegrator" for base in type(nested).__mro__):
-        raise ValueError(f"{what} draws silhouettes beside paths, which are no function of a path's numbers")
+        raise ValueError(
+            f"{what} draws silhouettes beside paths, which are no function of a path's numbers"
+        )
     if nested.aov_names():
         raise ValueError(
             f"{what} has further channels ({nested.aov_names()[0]}, …), which cannot be divided by a density"
