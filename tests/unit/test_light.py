@@ -133,11 +133,11 @@ def _command(*arguments: str) -> int:
     return main([*arguments])
 
 
-def test_the_command_writes_a_layer_for_each_length(tmp_path, capsys):
+def test_the_command_writes_a_layer_for_each_length(tmp_path, capfd):
     target = tmp_path / "all.exr"
-    small = ("--size", "16", "16", "-q")
+    small = ("--size", "16x16", "-q")
     assert _command("render", XML, "--max-depth", "3", "--spp", "4", *small, "-o", str(target)) == 0
-    assert "all light to depth 3" in capsys.readouterr().out
+    assert "all light to depth 3" in capfd.readouterr().out
     layers = pssflow._core.read_exr(str(target))
     names = ("R", "k0.R", "k1.G", "k2.B", "variance.R", "nonzero_share.R")
     assert set(names) <= layers.keys()
@@ -149,10 +149,10 @@ def test_the_command_writes_a_layer_for_each_length(tmp_path, capsys):
     np.testing.assert_array_equal(pssflow._core.read_exr(str(again))["R"], layers["R"])
 
 
-def test_the_command_refuses_both(tmp_path, capsys):
+def test_the_command_refuses_both(tmp_path, capfd):
     arguments = ("render", XML, "--k", "2", "--max-depth", "3", "-o", str(tmp_path / "x.exr"))
     assert _command(*arguments) != 0
-    assert "--max-depth" in capsys.readouterr().err
+    assert "--max-depth" in capfd.readouterr().err
     assert not list(tmp_path.iterdir())
 
 

@@ -67,6 +67,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..guide import LUMINANCE, Guide, registry
+from ..jit import columns as jit_columns
+from ..jit import to_jit
 from ..options import check_integer, check_number
 from . import replay
 
@@ -296,17 +298,17 @@ def define() -> Callable[[Any], Any]:
             sampler.replay(u)
             sampler.seed(int(rng.integers(2**32)), lanes)
             ray, ray_weight = camera.sample_ray_differential(
-                camera.shutter_open() + mi.Float(shutter) * camera.shutter_open_time(),
+                camera.shutter_open() + to_jit(mi.Float, shutter) * camera.shutter_open_time(),
                 0.0,
-                mi.Point2f(*(mi.Float(place[:, i]) for i in range(2))),
-                mi.Point2f(*(mi.Float(lens[:, i]) for i in range(2))),
+                jit_columns(mi.Point2f, mi.Float, place),
+                jit_columns(mi.Point2f, mi.Float, lens),
             )
             if ray.has_differentials:
                 ray.scale_differential(mi.Float(1.0 / np.sqrt(spp)))
             radiance, valid = _sample(self.nested, scene, sampler, ray)
             value = radiance * ray_weight
             value = dr.select(dr.all(dr.isfinite(value)), value, 0.0)
-            estimate = value / mi.Float(m)
+            estimate = value / to_jit(mi.Float, m)
             alpha = dr.select(valid, mi.Float(1.0), mi.Float(0.0))
             channels = [estimate.x, estimate.y, estimate.z]
             if block.channel_count() == 5:
@@ -319,9 +321,8 @@ def define() -> Callable[[Any], Any]:
             else:
                 at = corner + offset
             at = (at + np.array(film.crop_offset())).astype(np.float32)
-            block.put(
-                mi.Point2f(mi.Float(at[:, 0]), mi.Float(at[:, 1])), [c * weight for c in channels]
-            )
+            where = jit_columns(mi.Point2f, mi.Float, at)
+            block.put(where, [c * weight for c in channels])
             rgb = np.array(value, np.float32).reshape(3, -1)
             dr.eval(block.tensor())
             f = (LUMINANCE @ np.broadcast_to(rgb, (3, lanes))).astype(np.float32)

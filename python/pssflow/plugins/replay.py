@@ -40,6 +40,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..jit import to_jit
+
 __all__ = ["define"]
 
 
@@ -82,7 +84,7 @@ def define() -> Callable[[Any], Any]:
                 bad = rows[~((rows >= 0.0) & (rows < 1.0))][0]
                 raise ValueError(f"`u` holds {bad}; numbers must lie in [0, 1)")
             # Opaque, so that other numbers and other columns need no other kernel.
-            self.numbers = mi.Float(rows.ravel())
+            self.numbers = to_jit(mi.Float, rows)
             self.columns = dr.opaque(mi.UInt32, rows.shape[1])
 
         def seed(self, seed: Any, wavefront_size: int = 0xFFFFFFFF) -> None:
