@@ -11,7 +11,8 @@ by Mitsuba's own ray tracing, and
 derivative is unbiased for every parameter that moves no geometry, whatever the guide, since m ≥ a > 0. What moves
 geometry is refused by name: its discontinuities need other estimators.
 
-Where a lobe is a delta its weight is a constant, as in Mitsuba's `prb`; parameters of such lobes are refused too.
+Where a lobe is a delta its weight is a constant, as in Mitsuba's `prb`; parameters of such lobes are refused too. Paths
+go on where a surface reflects nothing, since it has a derivative all the same; `prb` ends them there.
 Paths are drawn and differentiated a few samples at a time, so that memory does not grow with their number.
 """
 
@@ -25,6 +26,7 @@ import mitsuba as mi
 import numpy as np
 
 from .guide import Guide
+from .jit import columns, to_jit
 
 if TYPE_CHECKING:
     from .render import Result
@@ -96,6 +98,8 @@ def backward(
 ) -> None:
     """Propagates the gradient of an image (H, W, C) to the scene's parameters; see `forward`."""
     for image, share in _images(ours, result, sensor, seed, spp, parametrisation):
+        if not dr.grad_enabled(image):
+            continue  # light of this length does not depend on the parameters
         dr.set_grad(image, grad * share)
         dr.enqueue(dr.ADMode.Backward, image)
         dr.traverse(dr.ADMode.Backward)
@@ -117,7 +121,9 @@ def forward(
     """
     total = None
     for image, share in _images(ours, result, sensor, seed, spp, parametrisation):
-        dr.forward_to(image)
+        # The parameters' own gradients stay: later passes need them, too.
+        kept = dr.ADFlag.ClearEdges | dr.ADFlag.ClearInterior | dr.ADFlag.AllowNoGrad
+        dr.forward_to(image, flags=kept)
         part = dr.detach(dr.grad(image)) * share
         total = part if total is None else total + part
         dr.eval(total)
@@ -136,11 +142,15 @@ def _images(
     film = sensor.film()
     pixels = int(np.prod(np.array(film.crop_size())))
     most = max(MOST_AT_ONCE // pixels, 1)
+<<<<<<< HEAD
     emitters = dr.gather(
         mi.UInt32,
         mi.UInt32(ours.exported.emitter_order or [0]),
         dr.arange(mi.UInt32, max(len(ours.exported.emitter_order), 1)),
     )
+=======
+    emitters = to_jit(mi.UInt32, np.array(ours.exported.emitter_order or [0], np.uint32))
+>>>>>>> light
     for k, guide, a, strategy in sources(result):
         for first in range(0, spp, most):
             n = min(most, spp - first)
@@ -187,7 +197,7 @@ def radiance(
     if film.rfilter().is_box_filter():
         at = np.floor(at)
     ctx = mi.BSDFContext()
-    active = mi.Bool(drawn["found"]) if k > 0 else mi.Bool(True)
+    active = to_jit(mi.Float, drawn["found"].astype(np.float32)) > 0.0 if k > 0 else mi.Bool(True)
     ray, ray_weight = sensor.sample_ray_differential(
         sensor.shutter_open(), 0.0, _vector(place, mi.Point2f), _vector(lens, mi.Point2f)
     )
@@ -208,11 +218,11 @@ def radiance(
     active &= si.is_valid()
 
     # ------------------- Emitter sample at x_k -----------------
-    scale = mi.Float(drawn["join_scale"]) / mi.Float(drawn["m_nee"])
+    scale = to_jit(mi.Float, drawn["join_scale"] / drawn["m_nee"])
     joined = active & (scale > 0.0)
     d = _vector(drawn["join_d"], mi.Vector3f)
     value = si.bsdf().eval(ctx, si, si.to_local(d), joined)
-    chosen = dr.gather(mi.UInt32, emitters, mi.UInt32(drawn["emitter"]), joined)
+    chosen = dr.gather(mi.UInt32, emitters, to_jit(mi.UInt32, drawn["emitter"]), joined)
     light = dr.gather(mi.EmitterPtr, scene.emitters_dr(), chosen, joined)
     delta = joined & mi.has_flag(light.flags(), mi.EmitterFlags.Delta)
     met = joined & ~delta
@@ -230,7 +240,7 @@ def radiance(
     result = dr.select(joined, found, 0.0)
 
     # --------------------- BSDF sample at x_k ------------------
-    scale = mi.Float(drawn["mis"]) / mi.Float(drawn["m_bsdf"])
+    scale = to_jit(mi.Float, drawn["mis"] / drawn["m_bsdf"])
     met = active & (scale > 0.0)
     d, factor = _step(ctx, si, drawn, k - 1, met)
     with dr.suspend_grad():
@@ -243,7 +253,7 @@ def radiance(
 def _step(ctx: Any, si: Any, drawn: dict[str, Any], b: int, active: Any) -> tuple[Any, Any]:
     """A direction that was drawn at x_{b+1}, and f_s·|cos θ| ÷ p with its graph."""
     d = _vector(drawn["step_d"][:, b], mi.Vector3f)
-    pdf = mi.Float(np.ascontiguousarray(drawn["step_pdf"][:, b]))
+    pdf = to_jit(mi.Float, drawn["step_pdf"][:, b])
     weight = _vector(drawn["step_weight"][:, b], mi.Spectrum)
     smooth = active & (pdf > 0.0)
     value = si.bsdf().eval(ctx, si, si.to_local(d), smooth)
@@ -251,7 +261,7 @@ def _step(ctx: Any, si: Any, drawn: dict[str, Any], b: int, active: Any) -> tupl
 
 
 def _vector(values: Any, kind: Any) -> Any:
-    return kind(*(mi.Float(np.ascontiguousarray(column)) for column in np.asarray(values).T))
+    return columns(kind, mi.Float, values)
 
 
 def _has_delta(bsdf: Any) -> bool:

@@ -221,12 +221,12 @@ def _sum(
 ) -> Result:
     from .render import Result
 
-    image = np.sum([part.image for part in parts], axis=0, dtype=np.float32)
-    variance = np.sum([part.variance for part in parts], axis=0, dtype=np.float32)
-    found, nonzero = (
-        np.sum([getattr(part, name) for part in parts], axis=0, dtype=np.uint32)
-        for name in ("found", "nonzero")
-    )
+    def total(name: str) -> Any:
+        values = [getattr(part, name) for part in parts]
+        return np.sum(values, axis=0, dtype=values[0].dtype)
+
+    image, variance = total("image"), total("variance")
+    found, nonzero = total("found"), total("nonzero")
     stats = [part.stats for part in parts]
     timings = dict(scene.timings)
     for name in ("pilot", "fit", "render"):
@@ -241,7 +241,13 @@ def _sum(
     guided = [record for record in stats if record["chosen"] != "none"]
     heaviest = [record["max_contribution"] * _luminance(record["mean"]) for record in stats]
     brightness = _luminance(mean)
+<<<<<<< HEAD
     relative = metrics.relative_variance(variance, image) if image.any() else None
+=======
+    # One sample of a length has no variance.
+    known = image.any() and np.isfinite(variance).all()
+    relative = metrics.relative_variance(variance, image) if known else None
+>>>>>>> light
     notes = [
         note for note in dict.fromkeys(n for r in stats for n in r["notes"]) if not _of_one(note)
     ]

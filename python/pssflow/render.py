@@ -51,8 +51,8 @@ class Result:
     parts: tuple[Result, ...] = ()
     """With `max_depth`, the light of each path length by itself: k = 0 (emission), 1 (direct light), 2, …"""
     layers: dict[str, F32] = field(default_factory=dict)
-    """What `write` adds to image and variance, (H, W, 3) each: with `max_depth` the light of each length as `k0`, `k1`, …
-    and the share of paths that carry light as `nonzero_share`."""
+    """What `write` adds to image and variance, (H, W, 3) each: with `max_depth` the light of each length as `k0`, `k1`,
+    …, and the share of paths that carry light as `nonzero_share`."""
     snapshots: tuple[Result, ...] = ()
     """What there was after each of the times `snapshots`, in the same form: each `stats` can be replayed."""
 

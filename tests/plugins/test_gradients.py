@@ -63,10 +63,8 @@ def test_paths_are_built_anew(name, k, llvm_variant):
         assert np.ptp(drawn["m_nee"]) > 0.1
 
 
-def _image(scene: Any, params: Any, integrator: Any, seed: int = 0, spp: int = 4) -> Any:
-    return mi.render(
-        scene, params, integrator=integrator, seed=seed, seed_grad=99, spp=spp, spp_grad=spp
-    )
+def _image(scene: Any, params: Any, integrator: Any, spp: int = 4) -> Any:
+    return mi.render(scene, params, integrator=integrator, seed_grad=99, spp=spp, spp_grad=spp)
 
 
 def _room() -> tuple[Any, Any]:
@@ -132,12 +130,16 @@ def test_what_else_is_refused(llvm_variant):
         integrator.render_backward(glass, params, None)
     scene, params = _room()
     hidden: Any = mi.load_dict({"type": "pssflow", "guide": "none", "hide_emitters": True})
-    with pytest.raises(RuntimeError):
+    with pytest.raises((ValueError, RuntimeError), match="`hide_emitters`"):
         dr.backward(dr.sum(_image(scene, params, hidden), axis=None))
     bold: Any = mi.load_dict(
         {"type": "pssflow", "guide": "realnvp", "realnvp_epochs": 1, "uniform_fraction": 0.0}
     )
+<<<<<<< HEAD
     with pytest.raises(RuntimeError):
+=======
+    with pytest.raises((ValueError, RuntimeError), match="uniform_fraction above 0"):
+>>>>>>> light
         dr.backward(dr.sum(_image(scene, params, bold), axis=None))
 
 

@@ -1,4 +1,4 @@
-"""`<integrator type="pss_guided">`: what it takes, refuses and reports. Its mean: `tests/statistical/test_guided.py`."""
+"""`<integrator type="pss_guided">`: what it takes, refuses and reports. Its mean is tested in `tests/statistical`."""
 
 from __future__ import annotations
 

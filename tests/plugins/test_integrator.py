@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -301,17 +300,6 @@ def test_unsupported_scenes_are_refused_when_rendered(variant):
     with pytest.raises((pssflow.UnsupportedError, RuntimeError)) as caught:
         mi.render(mi.load_dict(description), spp=1)
     assert 'BSDF "polarizer"' in first_line(caught.value)
-
-
-def test_it_has_no_gradients(llvm_variant):
-    scene = load()
-    parameters = mi.traverse(scene)
-    key = next(key for key in parameters.keys() if key.endswith("radiance.value"))  # noqa: SIM118
-    dr.enable_grad(parameters[key])
-    parameters.update()
-    rendered = mi.render(scene, parameters, spp=2)
-    with pytest.raises(RuntimeError, match="it has no derivatives"):
-        dr.backward(dr.mean(rendered, axis=None))
 
 
 def test_nothing_is_printed(scalar_variant, capfd):

@@ -25,10 +25,10 @@ RUNS = 8
 PARAMETERS = {
     "furnace_sphere": (
         *(f"{shape}.bsdf.brdf_0.reflectance.value" for shape in ("ball", "plate", "tube", "room")),
-        *("lamp.emitter.radiance.value", "lamp.bsdf.reflectance.value"),
+        "lamp.emitter.radiance.value",
     ),
     "open_sky": (
-        *("sky.radiance.value", "lantern.emitter.radiance.value", "lantern.bsdf.reflectance.value"),
+        *("sky.radiance.value", "lantern.emitter.radiance.value"),
         *(f"{s}.bsdf.brdf_0.reflectance.value" for s in ("roof", "wall", "tower", "ground")),
     ),
     "cornell-box": (
@@ -42,7 +42,7 @@ PARAMETERS = {
         "block.bsdf.brdf_0.weight.value",
     ),
 }
-"""Two of them are 0: a lamp's own reflectance."""
+"""None of them 0: there `prb` ends its paths (`test_gradients_are_finite_differences`)."""
 
 
 def gradients(
@@ -60,7 +60,11 @@ def gradients(
             scene,
             params,
             integrator=loaded,
+<<<<<<< HEAD
             seed=seed,
+=======
+            seed=seed,  # pyright: ignore[reportArgumentType]
+>>>>>>> light
             seed_grad=seed + 7000,
             spp=spp,
             spp_grad=spp,
@@ -89,7 +93,7 @@ def prb(scene: Any, names: tuple[str, ...], *, k: int, seeds: range, spp: int) -
 
 
 def _cases() -> list[Any]:
-    quick = {("furnace_sphere", 2), ("open_sky", 2)}
+    quick = {("furnace_sphere", 2)}
     return [
         pytest.param(*case, marks=[] if case in quick else [pytest.mark.long])
         for case in product(PARAMETERS, (1, 2, 3))
@@ -111,6 +115,7 @@ def test_gradients_are_those_of_prb(name: str, k: int) -> None:
     assert more.min() < ALPHA
 
 
+@pytest.mark.long
 def test_gradients_of_the_whole_light(llvm_variant: str) -> None:
     """H0: up to a depth, emission and direct light included, they are those of `prb` at the same depth."""
     scene, names = load_named("furnace_sphere"), PARAMETERS["furnace_sphere"]
@@ -125,10 +130,24 @@ def test_gradients_of_the_whole_light(llvm_variant: str) -> None:
 @pytest.mark.parametrize(
     ("name", "parameter"),
     [
+<<<<<<< HEAD
         ("furnace_sphere", "room.bsdf.brdf_0.reflectance.value"),
         ("open_sky", "sky.radiance.value"),
         pytest.param("cornell-box", "red.brdf_0.reflectance.value", marks=pytest.mark.long),
         pytest.param("glossy_room", "block.bsdf.brdf_0.weight.value", marks=pytest.mark.long),
+=======
+        # Black: its paths carry no light, but have a derivative.
+        ("furnace_sphere", "lamp.bsdf.reflectance.value"),
+        *(
+            pytest.param(name, parameter, marks=pytest.mark.long)
+            for name, parameter in (
+                ("furnace_sphere", "room.bsdf.brdf_0.reflectance.value"),
+                ("open_sky", "sky.radiance.value"),
+                ("cornell-box", "red.brdf_0.reflectance.value"),
+                ("glossy_room", "block.bsdf.brdf_0.weight.value"),
+            )
+        ),
+>>>>>>> light
     ],
 )
 def test_gradients_are_finite_differences(name: str, parameter: str) -> None:
@@ -138,15 +157,16 @@ def test_gradients_are_finite_differences(name: str, parameter: str) -> None:
     own = {"type": "pssflow", "k": 2, "guide": "direction-table"}
     ours = gradients(scene, own, (parameter,), seeds=range(RUNS), spp=32).sum(axis=1)
     params = mi.traverse(scene)
-    value = dr.detach(params[parameter])
+    value: Any = dr.detach(params[parameter])
     step, sides = 0.02, []
-    for sign in (1, -1):
-        params[parameter] = value + sign * step
+    low = value - step if np.array(value).min() > step else value
+    for at in (value + step, low):
+        params[parameter] = at
         params.update()
         sides.append(_two_bounces(scene))
     params[parameter] = value
     params.update()
-    truth = (sides[0] - sides[1]) / (2 * step)
+    truth = (sides[0] - sides[1]) / (step if low is value else 2 * step)
     p = float(p_value(Moments.of(ours), Moments.of(truth)))
     assert p > ALPHA, (ours.mean(), truth.mean(), p)
     assert float(p_value(Moments.of(1.1 * ours), Moments.of(truth))) < ALPHA
@@ -161,7 +181,7 @@ def _two_bounces(scene: Any) -> NDArray[np.float64]:
                 mi.render(
                     scene,
                     integrator=mi.load_dict({"type": "path", "max_depth": d, "rr_depth": 100}),
-                    seed=seed,
+                    seed=seed,  # pyright: ignore[reportArgumentType]
                     spp=128,
                 )
             )[..., :3].mean()

@@ -30,8 +30,8 @@ Learned primary-sample-space importance sampling (:monosp:`pss_guided`)
    - Added to that of ``mi.render``. (Default: 0)
 
 A pilot is rendered with uniform numbers that are written down; a guide q learns where they were bright; the rest is
-drawn from the mixture m = a + (1 − a)·q and divided by it. That is unbiased for every guide, since m ≥ a > 0, as long as
-radiance is a function of the camera ray and of numbers that come from the sampler: an integrator that remembers
+drawn from the mixture m = a + (1 − a)·q and divided by it. That is unbiased for every guide, since m ≥ a > 0, as long
+as radiance is a function of the camera ray and of numbers that come from the sampler: an integrator that remembers
 earlier samples, or draws numbers of its own, breaks it. The pilot's samples count half. Film position and lens are
 never learned.
 
@@ -67,6 +67,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..guide import LUMINANCE, Guide, registry
+from ..jit import columns as jit_columns
+from ..jit import to_jit
 from ..options import check_integer, check_number
 from . import replay
 
@@ -82,8 +84,8 @@ COLUMNS: dict[str, tuple[str, ...]] = {
     "DirectIntegrator": (*BOUNCE[:2], *BOUNCE[3:5], "lobe"),
     "BasicPRBIntegrator": BOUNCE[2:5],
 }
-"""What the numbers of a bounce decide, in the order in which LLVM variants draw them, by class. `DirectIntegrator` has one
-bounce. Integrators that are not here are guided as well; their columns have no names."""
+"""What the numbers of a bounce decide, in the order in which LLVM variants draw them, by class. `DirectIntegrator` has
+one bounce. Integrators that are not here are guided as well; their columns have no names."""
 
 SHARES = (0.1, 0.25, 0.5)
 """Shares of uniform paths that are tried."""
@@ -128,7 +130,7 @@ class _Candidate:
         # Guides ask for vertices, of which there are half as many as numbers; those of whole paths look at none.
         nowhere = np.zeros((len(u), (self.dimensions - 1) // 2, 3), np.float32)
         contexts = {"position": nowhere, "normal": nowhere, "outgoing": nowhere, "pixel": pixel}
-        options = {} if self.condition is None else {"condition": self.condition}
+        options: dict[str, Any] = {} if self.condition is None else {"condition": self.condition}
         return Guide.fit(
             self.name, u[:, : self.dimensions], np.abs(f), contexts=contexts, seed=seed, **options
         )
@@ -149,7 +151,7 @@ def define() -> Callable[[Any], Any]:
 
         def __init__(self, props: Any) -> None:
             super().__init__(props)
-            if "llvm" not in mi.variant():
+            if "llvm" not in str(mi.variant()):
                 raise ValueError(
                     f"integrator pss_guided: in {mi.variant()} lanes do not draw the same numbers; use llvm_ad_rgb"
                 )
@@ -207,7 +209,12 @@ def define() -> Callable[[Any], Any]:
         def to_string(self) -> str:
             """As Mitsuba prints its own."""
             inner = str(self.nested).replace("\n", "\n  ")
-            return f"GuidedIntegrator[\n  guide = {self.guide},\n  dimensions = {self.dimensions},\n  nested = {inner}\n]"
+            values = {"guide": self.guide, "dimensions": self.dimensions, "nested": inner}
+            return (
+                "GuidedIntegrator[\n"
+                + ",\n".join(f"  {k} = {v}" for k, v in values.items())
+                + "\n]"
+            )
 
         def _fill(self, scene: Any, camera: Any, block: Any, spp: int, bits: Any) -> None:
             """Pilot, guide, rest."""
@@ -240,7 +247,8 @@ def define() -> Callable[[Any], Any]:
                 "seconds": {"pilot": pilot_s, "fit": fit_s, "render": render_s},
             }
             gained = "" if gain is None else f", variance of a sample lower by {gain:.2f}"
-            mi.Log(mi.LogLevel.Info, f"pss_guided: {self.stats['chosen']} at a = {a:g}{gained}")
+            log: Any = mi.Log
+            log(mi.LogLevel.Info, f"pss_guided: {self.stats['chosen']} at a = {a:g}{gained}")
 
         def _passes(
             self,
@@ -290,17 +298,17 @@ def define() -> Callable[[Any], Any]:
             sampler.replay(u)
             sampler.seed(int(rng.integers(2**32)), lanes)
             ray, ray_weight = camera.sample_ray_differential(
-                camera.shutter_open() + mi.Float(shutter) * camera.shutter_open_time(),
+                camera.shutter_open() + to_jit(mi.Float, shutter) * camera.shutter_open_time(),
                 0.0,
-                mi.Point2f(*(mi.Float(place[:, i]) for i in range(2))),
-                mi.Point2f(*(mi.Float(lens[:, i]) for i in range(2))),
+                jit_columns(mi.Point2f, mi.Float, place),
+                jit_columns(mi.Point2f, mi.Float, lens),
             )
             if ray.has_differentials:
                 ray.scale_differential(mi.Float(1.0 / np.sqrt(spp)))
             radiance, valid = _sample(self.nested, scene, sampler, ray)
             value = radiance * ray_weight
             value = dr.select(dr.all(dr.isfinite(value)), value, 0.0)
-            estimate = value / mi.Float(m)
+            estimate = value / to_jit(mi.Float, m)
             alpha = dr.select(valid, mi.Float(1.0), mi.Float(0.0))
             channels = [estimate.x, estimate.y, estimate.z]
             if block.channel_count() == 5:
@@ -313,9 +321,8 @@ def define() -> Callable[[Any], Any]:
             else:
                 at = corner + offset
             at = (at + np.array(film.crop_offset())).astype(np.float32)
-            block.put(
-                mi.Point2f(mi.Float(at[:, 0]), mi.Float(at[:, 1])), [c * weight for c in channels]
-            )
+            where = jit_columns(mi.Point2f, mi.Float, at)
+            block.put(where, [c * weight for c in channels])
             rgb = np.array(value, np.float32).reshape(3, -1)
             dr.eval(block.tensor())
             f = (LUMINANCE @ np.broadcast_to(rgb, (3, lanes))).astype(np.float32)

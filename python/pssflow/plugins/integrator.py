@@ -71,9 +71,10 @@ Learned light of exactly k bounces (:monosp:`pssflow`)
      keys cannot hold the dot of the command's ``--set realnvp.epochs=7``. Options of another guide are refused.
 
 Without ``max_depth`` it renders only light that was reflected exactly k times on its way from an emitter: no emitter is
-seen, and for k = 2 no direct light. The image is unbiased for every guide as long as ``uniform_fraction`` is positive, since each sample is
-divided by the mixture's density; the preset ``thesis`` has none and may be biased. A guide costs a pilot and training
-in every call of ``render``: expect no gain at few samples, nor in easy scenes, and compare with ``guide`` = ``none``.
+seen, and for k = 2 no direct light. The image is unbiased for every guide as long as ``uniform_fraction`` is positive,
+since each sample is divided by the mixture's density; the preset ``thesis`` has none and may be biased. A guide costs a
+pilot and training in every call of ``render``: expect no gain at few samples, nor in easy scenes, and compare with
+``guide`` = ``none``.
 
 Paths are traced by pssflow's core, not by Mitsuba, in ``scalar_rgb`` and ``llvm_ad_rgb``; other variants know no such
 plugin. The scene is read anew in each call, edits through ``mi.traverse`` included, and may hold only what ``pssflow
@@ -81,9 +82,9 @@ info`` calls supported. Alpha is 1 everywhere. Attribute ``result`` keeps the la
 statistics, the guide.
 
 In ``llvm_ad_rgb`` it is differentiable: after ``mi.render(scene, params, …)`` come ``dr.backward`` or ``dr.forward``.
-The guides of that render draw paths with a seed of their own, ``spp_grad`` a pixel for each length, and Dr.Jit evaluates
-BSDFs, textures and emitters along them. Parameters that move geometry, or that belong to delta lobes, are refused by
-name, and so are hidden emitters and a sun beside a sky.
+The guides of that render draw paths with a seed of their own, ``spp_grad`` a pixel for each length, and Dr.Jit
+evaluates BSDFs, textures and emitters along them. Parameters that move geometry, or that belong to delta lobes, are
+refused by name, and so are hidden emitters and a sun beside a sky.
 
 .. tabs::
     .. code-tab:: xml

@@ -40,6 +40,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..jit import to_jit
+
 __all__ = ["define"]
 
 
@@ -51,7 +53,7 @@ def define() -> Callable[[Any], Any]:
 
         def __init__(self, props: Any = None) -> None:
             super().__init__(mi.Properties() if props is None else props)
-            if "llvm" not in mi.variant():
+            if "llvm" not in str(mi.variant()):
                 raise ValueError(
                     f"sampler pss_replay: the variant {mi.variant()} hands out one number at a time; use llvm_ad_rgb"
                 )
@@ -60,7 +62,7 @@ def define() -> Callable[[Any], Any]:
             # Loops of Dr.Jit carry these along: a counter that is a number of Python would stand still in them.
             self.drawn = mi.UInt32(0)
             self.lane = mi.UInt32(0)
-            self.rng = mi.PCG32()
+            self.rng = self._generator()
             self.numbers = mi.Float(0.0)
             self.columns = mi.UInt32(0)
 
@@ -82,7 +84,7 @@ def define() -> Callable[[Any], Any]:
                 bad = rows[~((rows >= 0.0) & (rows < 1.0))][0]
                 raise ValueError(f"`u` holds {bad}; numbers must lie in [0, 1)")
             # Opaque, so that other numbers and other columns need no other kernel.
-            self.numbers = mi.Float(rows.ravel())
+            self.numbers = to_jit(mi.Float, rows)
             self.columns = dr.opaque(mi.UInt32, rows.shape[1])
 
         def seed(self, seed: Any, wavefront_size: int = 0xFFFFFFFF) -> None:
@@ -91,8 +93,10 @@ def define() -> Callable[[Any], Any]:
             super().seed(seed, lanes)
             self.lane = dr.arange(mi.UInt32, lanes)
             self.drawn = dr.zeros(mi.UInt32, lanes)
-            state, stream = mi.sample_tea_32(mi.UInt32(seed) + mi.UInt32(self.base), self.lane)
-            self.rng = mi.PCG32(initstate=mi.UInt64(state), initseq=mi.UInt64(stream))
+            # As Mitsuba's own samplers seed theirs.
+            tea: Any = mi.sample_tea_32
+            state, stream = tea(mi.UInt32(seed) + mi.UInt32(self.base), self.lane)
+            self.rng = self._generator(initstate=mi.UInt64(state), initseq=mi.UInt64(stream))
 
         def next_1d(self, active: Any = True) -> Any:
             """The next column of each active lane."""
@@ -110,6 +114,11 @@ def define() -> Callable[[Any], Any]:
             x = self.next_1d(active)
             return mi.Point2f(x, self.next_1d(active))
 
+        @staticmethod
+        def _generator(*arguments: Any, **named: Any) -> Any:
+            generator: Any = mi.PCG32
+            return generator(*arguments, **named)
+
         def fork(self) -> Any:
             """A sampler of the same kind, without numbers."""
             other = ReplaySampler()
@@ -121,7 +130,7 @@ def define() -> Callable[[Any], Any]:
             """A copy in the same state; also of a sampler that was not seeded yet."""
             other = self.fork()
             other.drawn, other.lane = mi.UInt32(self.drawn), mi.UInt32(self.lane)
-            other.rng = mi.PCG32(self.rng)
+            other.rng = self._generator(self.rng)
             other.numbers, other.columns = mi.Float(self.numbers), mi.UInt32(self.columns)
             return other
 
