@@ -13,7 +13,7 @@ from typing import Any
 from ...files import first_line
 from ...guide import Guide
 from ...scene import Scene
-from .case import Case, Effort, Finding, render_options
+from .case import THESIS, Case, Effort, Finding, render_options
 from .parts import room
 
 __all__ = ["FILES", "MEMORY"]

@@ -3,8 +3,8 @@
 A guide *holds* where its images are finite and unbiased (Welch's test of the mean and of tiles against the truth), no
 path weighs more than 1/a, E[(f/m)²] ≤ E[f²]/a within its error, and its relMSE is at most 1.3 times that of as many
 random samples (median over seeds). It *degrades* where it is only slower, and *fails* where one of the others
-breaks, or at a = 0 is more than ten times slower. (With a > 0 the second moment has a bound. The variance, which is what is left
-of it without I², can exceed 1/a times that of random numbers where these have hardly any.)
+breaks, or at a = 0 is more than ten times slower. (With a > 0 the second moment has a bound. The variance, which is
+what is left of it without I², can exceed 1/a times that of random numbers where these have hardly any.)
 """
 
 from __future__ import annotations
