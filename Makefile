@@ -95,6 +95,10 @@ study-guides: build ## what each guide gains, costs and comes to at equal time: 
 study-speed-accuracy: build $(VENV)/.studies ## error against wall time, Mitsuba and others beside the guides: an hour, out/study-speed-accuracy; resumes
 	$(BIN)/python -m pssflow study speed-accuracy -o out/study-speed-accuracy
 
+.PHONY: study-stability
+study-stability: build ## planted failures with every guide: what holds, degrades or fails; out/study-stability; resumes
+	$(BIN)/python -m pssflow study stability -o out/study-stability
+
 .PHONY: docs
 docs: build $(VENV)/.docs ## Rust API into target/doc, Python API into out/docs
 	RUSTDOCFLAGS="-D warnings" cargo doc --workspace --no-deps
