@@ -216,14 +216,15 @@ impl Run<'_> {
         let mixture = Mixture {
             uniform_fraction: self.current.uniform_fraction,
         };
-        let record = if self.options.guide.learns() {
+        let mut record = if self.options.guide.learns() {
             record
         } else {
             0.0
         };
         let mut older = self.records.len();
         if record > 0.0 {
-            self.reserve_records();
+            // Those of the tiles under way need room, too, until they are merged.
+            record *= self.reserve_records();
         }
         let pass = Pass {
             phase: if pilot { Phase::Pilot } else { Phase::Render },

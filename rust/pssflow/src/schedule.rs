@@ -225,7 +225,8 @@ impl Run<'_> {
     }
 
     /// Makes room for all records at once, as far as so many can come and their number is no wish beyond what memory holds.
-    pub(crate) fn reserve_records(&mut self) {
+    /// Returns the share of them that there is room for.
+    pub(crate) fn reserve_records(&mut self) -> f32 {
         let film = self.context.tracer.scene().film().pixels() as f64;
         let paths = match &self.options.budget {
             Budget::Spp(spp) => film * f64::from(*spp),
@@ -241,6 +242,7 @@ impl Run<'_> {
             self.max_records = room;
             self.short_of_memory = true;
         }
+        room as f32 / wanted.max(1) as f32
     }
 
     /// Share of the light-carrying paths of a pass of `spp` to keep, as many as [`Self::most_kept`] if about as many carry

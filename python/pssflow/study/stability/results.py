@@ -194,8 +194,8 @@ def publish(
 
 CAPTION = (
     "Numbers are relMSE ÷ that of as many random samples (medians over seeds; means in cases 3 and 15). Holds: finite, "
-    "unbiased, no weight above 1/a, at most 1.3. Degrades: safe, but slower. Fails: biased, unbounded, not finite, or at "
-    "a = 0 more than ten times slower. "
+    "unbiased, no weight above 1/a, at most 1.3. Degrades: safe, but slower. Fails: biased, unbounded, not finite, or "
+    "at a = 0 more than ten times slower. "
     "thesis: a = 0; all others with the guide's own share a of random numbers."
 )
 
