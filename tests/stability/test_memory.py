@@ -58,7 +58,7 @@ def _growth(renders: int) -> int:
 
 
 def test_memory_is_flat() -> None:
-    """Forty renders behind forty others: the records of each (2 MB), if leaked, would be seen; less is the long tier's."""
+    """Forty renders behind forty others: if each leaked its records (2 MB), it would be seen."""
     assert _growth(80) < MOST_GROWTH
 
 
