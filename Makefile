@@ -113,6 +113,10 @@ results: build $(VENV)/.studies ## docs/results.md and its CSV from a study of o
 	$(BIN)/python -m pssflow study guides $(RESULTS_SCENES) --guides $(RESULTS_GUIDES) $(RESULTS_OPTIONS) -o out/results
 	$(BIN)/python -m pssflow study results out/results -o docs/results.md
 
+.PHONY: study-stability
+study-stability: build ## planted failures with every guide: what holds, degrades or fails; out/study-stability; resumes
+	$(BIN)/python -m pssflow study stability -o out/study-stability
+
 .PHONY: docs
 docs: build $(VENV)/.docs ## Rust API into target/doc, Python API into out/docs
 	RUSTDOCFLAGS="-D warnings" cargo doc --workspace --no-deps

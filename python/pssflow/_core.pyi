@@ -189,9 +189,11 @@ class Scene:
         Returns image (h,w,3), variance (h,w,3) [variance of the mean], found and nonzero (h,w) uint32 [per pixel,
         over all paths in the image], and "record": JSON string with
         {"chosen", "a", "k", "parametrisation", "emitter_strategy", "combine", "seed", "threads", "camera_rays",
-         "paths_found", "nonzero", "nonzero_share", "outside", "non_finite", "pilot": {same counts}, "mean": [r,g,b],
+         "paths_found", "nonzero", "nonzero_share", "outside", "non_finite",
+         "pilot": {the same, "mean_square"}, "mean": [r,g,b],
          "variance": relMSE's formula with the own variance of the mean, "max_weight", "max_contribution", "ess",
-         "passes": [pass], "candidates": what `auto` considered, [{"name","a","predicted_gain","cost_ratio",
+         "diagnostics": what docs/diagnostics.md explains, "passes": [pass],
+         "candidates": what `auto` considered, [{"name","a","predicted_gain","cost_ratio",
          "training_share","net_gain","chosen","why"}] or null, "notes": [str],
          "training": {"loss","seconds","dropped_nonfinite","outliers_removed","trained_on","samples",
          "guide": its `describe`} or null, "seconds": {"pilot","fit","render"},

@@ -142,15 +142,7 @@ def _images(
     film = sensor.film()
     pixels = int(np.prod(np.array(film.crop_size())))
     most = max(MOST_AT_ONCE // pixels, 1)
-<<<<<<< HEAD
-    emitters = dr.gather(
-        mi.UInt32,
-        mi.UInt32(ours.exported.emitter_order or [0]),
-        dr.arange(mi.UInt32, max(len(ours.exported.emitter_order), 1)),
-    )
-=======
     emitters = to_jit(mi.UInt32, np.array(ours.exported.emitter_order or [0], np.uint32))
->>>>>>> light
     for k, guide, a, strategy in sources(result):
         for first in range(0, spp, most):
             n = min(most, spp - first)

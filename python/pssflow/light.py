@@ -241,13 +241,9 @@ def _sum(
     guided = [record for record in stats if record["chosen"] != "none"]
     heaviest = [record["max_contribution"] * _luminance(record["mean"]) for record in stats]
     brightness = _luminance(mean)
-<<<<<<< HEAD
-    relative = metrics.relative_variance(variance, image) if image.any() else None
-=======
     # One sample of a length has no variance.
     known = image.any() and np.isfinite(variance).all()
     relative = metrics.relative_variance(variance, image) if known else None
->>>>>>> light
     notes = [
         note for note in dict.fromkeys(n for r in stats for n in r["notes"]) if not _of_one(note)
     ]

@@ -49,7 +49,7 @@ def runs_table(runs: Sequence[Mapping[str, Any]], thesis: ThesisScene | None = N
     if thesis is not None:
         headings.append(f"thesis, {thesis.title}")
     headings += ["relMSE", "trimmed", "gain"] if measured else ["rel. variance"]
-    headings += ["max 1/m", "max f/m ÷ mean"]
+    headings += ["max 1/m", "max f/m ÷ mean", "tail k"]
     for heading in headings:
         shown.add_column(heading, justify="right", overflow="fold")
     for run in runs:
@@ -72,6 +72,8 @@ def runs_table(runs: Sequence[Mapping[str, Any]], thesis: ThesisScene | None = N
         else:
             cells.append(number(run["variance"]))
         cells += [number(run["max_weight"], 3), number(run["max_contribution"], 3)]
+        tail = run["diagnostics"]["pareto_k"]
+        cells.append("" if tail is None else f"{tail:.2f}")
         shown.add_row(*cells)
     return shown
 

@@ -50,7 +50,8 @@ def test_wild_guides_are_told_in_one_line(
     counts = _check(kind, range(QUICK), tmp_path)
     record |= dict(counts)
     assert counts["refused"] > QUICK / 5
-    assert counts["rendered"] > QUICK / 50
+    # A file's checksum lets next to no damage pass.
+    assert kind == "guide files" or counts["rendered"] > QUICK / 50
 
 
 def test_whole_guides_render(tmp_path: Path) -> None:

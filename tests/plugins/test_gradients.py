@@ -135,11 +135,7 @@ def test_what_else_is_refused(llvm_variant):
     bold: Any = mi.load_dict(
         {"type": "pssflow", "guide": "realnvp", "realnvp_epochs": 1, "uniform_fraction": 0.0}
     )
-<<<<<<< HEAD
-    with pytest.raises(RuntimeError):
-=======
     with pytest.raises((ValueError, RuntimeError), match="uniform_fraction above 0"):
->>>>>>> light
         dr.backward(dr.sum(_image(scene, params, bold), axis=None))
 
 

@@ -60,11 +60,7 @@ def gradients(
             scene,
             params,
             integrator=loaded,
-<<<<<<< HEAD
-            seed=seed,
-=======
             seed=seed,  # pyright: ignore[reportArgumentType]
->>>>>>> light
             seed_grad=seed + 7000,
             spp=spp,
             spp_grad=spp,
@@ -130,12 +126,6 @@ def test_gradients_of_the_whole_light(llvm_variant: str) -> None:
 @pytest.mark.parametrize(
     ("name", "parameter"),
     [
-<<<<<<< HEAD
-        ("furnace_sphere", "room.bsdf.brdf_0.reflectance.value"),
-        ("open_sky", "sky.radiance.value"),
-        pytest.param("cornell-box", "red.brdf_0.reflectance.value", marks=pytest.mark.long),
-        pytest.param("glossy_room", "block.bsdf.brdf_0.weight.value", marks=pytest.mark.long),
-=======
         # Black: its paths carry no light, but have a derivative.
         ("furnace_sphere", "lamp.bsdf.reflectance.value"),
         *(
@@ -147,7 +137,6 @@ def test_gradients_of_the_whole_light(llvm_variant: str) -> None:
                 ("glossy_room", "block.bsdf.brdf_0.weight.value"),
             )
         ),
->>>>>>> light
     ],
 )
 def test_gradients_are_finite_differences(name: str, parameter: str) -> None:

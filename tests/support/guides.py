@@ -62,8 +62,8 @@ def guide_file(case: Case, report: Report) -> Answer:
         path.unlink(missing_ok=True)
 
 
-def _damaged(data: bytes, rng: random.Random) -> bytes:
-    data = bytearray(data)
+def _damaged(whole: bytes, rng: random.Random) -> bytes:
+    data = bytearray(whole)
     for _ in range(rng.choice([1, 1, 1, 2, 5])):
         at = rng.randrange(len(data)) if rng.random() < 0.4 else rng.randrange(min(len(data), 600))
         kind = rng.randrange(8)

@@ -24,8 +24,8 @@ CORNELL = Path(__file__).parents[2] / "scenes" / "cornell-box" / "scene.xml"
 COUNTS = {"camera_rays", "paths_found", "nonzero", "nonzero_share", "outside"}
 RUN = COUNTS | {
     "scene", "guide", "chosen", "a", "k", "parametrisation", "emitter_strategy", "seed", "threads", "pilot", "mean",
-    "variance", "relmse", "relmse_trimmed", "max_weight", "max_contribution", "ess", "passes", "notes", "training",
-    "seconds", "budget", "version", "variant",
+    "variance", "relmse", "relmse_trimmed", "max_weight", "max_contribution", "ess", "diagnostics", "passes", "notes",
+    "training", "seconds", "budget", "version", "variant",
 }  # fmt: skip
 """Names of a run's JSON object that others rely on."""
 

@@ -27,7 +27,7 @@ TINY = ("--variant", "scalar_rgb", "-D", "resolution=16")
 RUN_KEYS = {
     "scene", "guide", "chosen", "a", "k", "parametrisation", "seed", "threads", "camera_rays", "paths_found",
     "nonzero", "nonzero_share", "pilot", "mean", "variance", "relmse", "relmse_trimmed", "max_weight",
-    "max_contribution", "ess", "seconds",
+    "max_contribution", "ess", "diagnostics", "seconds",
 }  # fmt: skip
 """What `--json` promises."""
 

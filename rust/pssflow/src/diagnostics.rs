@@ -18,7 +18,7 @@ const MEAN_ERRORS: f64 = 4.0;
 
 /// Share of all light in a single path that is told, if there are at least so many paths.
 const ONE_PATH: f64 = 0.1;
-const ENOUGH_PATHS: u64 = 1000;
+const ENOUGH_PATHS: u64 = 10_000;
 
 /// Share of the pixels whose energy is told: the brightest ones.
 const BRIGHTEST: f64 = 0.001;

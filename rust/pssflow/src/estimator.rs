@@ -133,6 +133,8 @@ pub fn render(
         apart: Vec::new(),
         next_sample: 0,
         records: PathRecords::default(),
+        max_records: options.max_records,
+        short_of_memory: false,
         lit: 1.0,
         emitters: intervals
             .map(|(cdf, environment)| Emitter { cdf, environment })
@@ -179,6 +181,10 @@ pub(crate) struct Run<'a> {
     /// Samples per pixel so far.
     pub(crate) next_sample: u32,
     pub(crate) records: PathRecords,
+    /// As in the options, or as many as memory holds.
+    pub(crate) max_records: usize,
+    /// Whether it did not hold all.
+    pub(crate) short_of_memory: bool,
     /// Share of the last pass's paths that carried light.
     pub(crate) lit: f64,
     pub(crate) emitters: Vec<Emitter>,
@@ -213,14 +219,15 @@ impl Run<'_> {
         let mixture = Mixture {
             uniform_fraction: self.current.uniform_fraction,
         };
-        let record = if self.options.guide.learns() {
+        let mut record = if self.options.guide.learns() {
             record
         } else {
             0.0
         };
         let mut older = self.records.len();
         if record > 0.0 {
-            self.reserve_records();
+            // Those of the tiles under way need room, too, until they are merged.
+            record *= self.reserve_records();
         }
         let pass = Pass {
             phase: if pilot { Phase::Pilot } else { Phase::Render },
@@ -241,13 +248,14 @@ impl Run<'_> {
             &mut self.image
         };
         let statistics = self.context.render(&pass, image, &mut self.records)?;
+        self.short_of_memory |= statistics.short_of_memory;
         self.apart.extend(own.filter(|_| !discarded));
         if record > 0.0 {
             self.records.count(statistics.counts.camera_rays);
             // Where memory ran out, older ones gave way.
             older = older.min(self.records.len());
             let newer = self.records.len() - older;
-            let rest = self.options.max_records.saturating_sub(newer);
+            let rest = self.max_records.saturating_sub(newer);
             self.records.thin(older, [rest, newer]);
         }
         self.lit = statistics.counts.lit_share();
@@ -337,7 +345,7 @@ impl Run<'_> {
             _ => {}
         }
         notes.extend(self.current.diverged.clone());
-        if self.pilot.short_of_memory || self.rendered.short_of_memory {
+        if self.short_of_memory {
             notes.push("memory was short: fewer paths were kept to learn from".to_owned());
         }
         let [width, height] = scene.film().crop_size();

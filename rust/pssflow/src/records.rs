@@ -69,19 +69,42 @@ impl PathRecords {
         }
     }
 
-    /// Makes room for so many paths in all, if there is. Growing step by step would copy them again and again, into fresh
-    /// pages.
-    pub(crate) fn reserve(&mut self, paths: usize, width: usize, contexts: bool) {
-        let more = paths.saturating_sub(self.len());
-        let vertices = if contexts { more * (width / 2) } else { 0 };
-        // Where there is none, they find theirs as they come.
-        let _ = self.u.try_reserve_exact(more * width);
-        let _ = self.ray.try_reserve_exact(more);
-        for numbers in self.numbers() {
-            let _ = numbers.try_reserve_exact(more);
+    /// Makes room for so many paths in all, and says for how many there is. Growing step by step would copy them again and
+    /// again, into fresh pages. Where memory does not suffice for all, half of what it holds is left to those who learn.
+    pub(crate) fn reserve(&mut self, paths: usize, width: usize, contexts: bool) -> usize {
+        let vertices = if contexts { width / 2 } else { 0 };
+        let mut room = paths;
+        while !self.try_reserve(room, width, vertices) {
+            self.shrink();
+            room /= 2;
         }
-        let _ = self.contexts.try_reserve_exact(vertices);
-        let _ = self.pixel.try_reserve_exact(more);
+        if room < paths {
+            self.shrink();
+            room /= 2;
+            // What fitted twice fits once; and if not, paths find their place as they come.
+            self.try_reserve(room, width, vertices);
+        }
+        room
+    }
+
+    fn try_reserve(&mut self, paths: usize, width: usize, vertices: usize) -> bool {
+        let more = paths.saturating_sub(self.len());
+        let mut room = self.u.try_reserve_exact(more * width).is_ok();
+        for numbers in self.numbers() {
+            room = room && numbers.try_reserve_exact(more).is_ok();
+        }
+        room && self.contexts.try_reserve_exact(more * vertices).is_ok()
+            && self.ray.try_reserve_exact(more).is_ok()
+            && self.pixel.try_reserve_exact(more).is_ok()
+    }
+
+    /// Gives back what no path fills.
+    fn shrink(&mut self) {
+        self.u.shrink_to_fit();
+        self.numbers().into_iter().for_each(Vec::shrink_to_fit);
+        self.contexts.shrink_to_fit();
+        self.ray.shrink_to_fit();
+        self.pixel.shrink_to_fit();
     }
 
     /// Keeps, evenly from first to last, `most[0]` of the first `older` paths and `most[1]` of those behind them; each
@@ -245,5 +268,20 @@ mod tests {
         assert!((sum(&records) / before - 1.0).abs() < 0.02);
         records.thin(50, [0, 0]);
         assert!(records.u.is_empty() && records.pixel.is_empty());
+    }
+
+    #[test]
+    fn room_that_no_memory_holds_is_halved_until_it_does() {
+        let mut records = PathRecords::default();
+        assert_eq!(records.reserve(1000, 5, true), 1000);
+        // No address space has room for so many; half of what there is room for stays free.
+        let wanted = usize::MAX / 4096;
+        let room = records.reserve(wanted, 5, true);
+        assert!(room < wanted / 2, "{room}");
+        assert!(records.u.capacity() < wanted);
+        // Paths that are there stay.
+        records.f = vec![1.0; 3];
+        records.reserve(wanted, 5, false);
+        assert_eq!(records.len(), 3);
     }
 }

@@ -225,18 +225,24 @@ impl Run<'_> {
     }
 
     /// Makes room for all records at once, as far as so many can come and their number is no wish beyond what memory holds.
-    pub(crate) fn reserve_records(&mut self) {
+    /// Returns the share of them that there is room for.
+    pub(crate) fn reserve_records(&mut self) -> f32 {
         let film = self.context.tracer.scene().film().pixels() as f64;
         let paths = match &self.options.budget {
             Budget::Spp(spp) => film * f64::from(*spp),
             Budget::Time(time) => time * MOST_PATHS_PER_SECOND,
             Budget::Replay(passes) => film * passes.iter().map(|p| f64::from(p.spp)).sum::<f64>(),
         };
-        let most = self.options.max_records.min(MOST_RESERVED) as f64;
+        let most = self.max_records.min(MOST_RESERVED) as f64;
         let width = self.context.tracer.columns().learned();
         let contexts = self.options.guide.looks_at_contexts();
-        self.records
-            .reserve(most.min(paths) as usize, width, contexts);
+        let wanted = most.min(paths) as usize;
+        let room = self.records.reserve(wanted, width, contexts);
+        if room < wanted {
+            self.max_records = room;
+            self.short_of_memory = true;
+        }
+        room as f32 / wanted.max(1) as f32
     }
 
     /// Share of the light-carrying paths of a pass of `spp` to keep, as many as [`Self::most_kept`] if about as many carry
@@ -256,7 +262,7 @@ impl Run<'_> {
     /// Most paths of one pass that are kept: half of all, if more passes are to teach, whatever there is already gives
     /// way to them.
     pub(crate) fn most_kept(&self) -> usize {
-        let most = self.options.max_records;
+        let most = self.max_records;
         if self.options.guide.refines() {
             most.div_ceil(2)
         } else {

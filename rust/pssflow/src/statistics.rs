@@ -96,7 +96,7 @@ pub struct Statistics {
     pub squares: [Moments; 2],
     /// The largest lum(f/m).
     pub tail: Tail,
-    /// Whether memory for the paths to learn from ran out, so that fewer were kept.
+    /// Of a pass: whether memory for the paths to learn from ran out, so that fewer were kept.
     pub short_of_memory: bool,
     /// Largest 1/m of a path that carries light.
     pub max_weight: f32,
@@ -129,7 +129,6 @@ impl Statistics {
             own.add(other);
         }
         self.tail.merge(&other.tail);
-        self.short_of_memory |= other.short_of_memory;
         self.max_weight = self.max_weight.max(other.max_weight);
         self.max_estimate = self.max_estimate.max(other.max_estimate);
         self.sum += other.sum;
