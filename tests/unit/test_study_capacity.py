@@ -13,7 +13,7 @@ import pssflow
 from pssflow import metrics
 from pssflow.cli import main
 from pssflow.metrics import Estimate
-from pssflow.study import capacity
+from pssflow.study import capacity, harness
 from pssflow.study.capacity import FAMILIES, Family, capacity_methods
 from pssflow.study.capacity_report import enough, models
 from pssflow.study.predicted import HeldOut
@@ -21,6 +21,12 @@ from tests import scenes
 from tests.unit.test_study_guides import study, synthetic
 
 ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch) -> None:
+    """FLIP takes a quarter of a second an image."""
+    monkeypatch.setattr(harness, "flip", lambda image, truth: None)
 
 
 @pytest.fixture(scope="module")

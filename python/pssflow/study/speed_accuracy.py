@@ -10,11 +10,15 @@ from .command import Defaults, study_command
 
 __all__ = ["speed_accuracy"]
 
-STANDARD = ("none", "table", "auto", "mitsuba-llvm", "python-vegas", "mitsuba-path")
+STANDARD = ("none", "table", "auto", "mitsuba-llvm", "python-vegas")
 
 
 def standard(full: bool) -> list[str]:
-    """The standard set; with `full` all guides, and Mitsuba's scalar variant, where Python's own speed is measured."""
+    """The standard set, an hour; with `full` all guides, and all that is Mitsuba's.
+
+    That is its scalar variant, where Python's own speed is measured, and its `path` with all light, which takes
+    references of its own.
+    """
     if not full:
         return list(STANDARD)
     from .guides import standard as guides
@@ -36,7 +40,8 @@ def standard(full: bool) -> list[str]:
 def speed_accuracy() -> None:
     """Error against wall time: guides, Mitsuba (mitsuba-llvm, mitsuba-scalar) and python-vegas, training inside.
 
-    mitsuba-path is all light by Mitsuba's path, against its own reference: charted apart, compared with no other.
+    mitsuba-path is all light by Mitsuba's path, against its own reference: charted apart, compared with no other. It
+    takes part with --full, or where --guides names it.
 
     SCENES are XML files or names (`scenes/door-ajar`, `veach-ajar`); the default are six. Writes results.csv, tables,
     charts, EXRs and report.html, which opens without a network, to DIR; run again, it goes on where it stopped.

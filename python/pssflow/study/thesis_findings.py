@@ -66,6 +66,8 @@ def _told(found: Sequence[Found], theirs: float) -> str:
     verdict = (
         f"“{best.experiment.name}” alone would explain it: {best.experiment.tells}"
         if best.ratio >= 0.9 * theirs
+        else f"“{best.experiment.name}” explains most of it: {best.experiment.tells}"
+        if best.ratio - 1.0 >= 0.5 * (theirs - 1.0)
         else "none of them alone explains it"
     )
     return (
