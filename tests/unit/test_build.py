@@ -55,6 +55,7 @@ def test_make_help_lists_every_target() -> None:
             "coverage",
             "study-guides",
             "study-speed-accuracy",
+            "study-stability",
             "docs",
             "clean",
         )
