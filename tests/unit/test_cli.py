@@ -327,7 +327,7 @@ def pixels(path: Path) -> np.ndarray[Any, Any]:
 
 
 def test_render_writes_image_variance_and_record(command, tmp_path):
-    outcome = command("render", CORNELL, "-o", "out.exr", "--guide", "none", "--spp", 4, *TINY)
+    outcome = command("render", CORNELL, "-o", "out.exr", "--guide", "none", "--spp", 32, *TINY)
     assert outcome.code == 0, outcome.err
     assert outcome.err == ""
     assert "wrote out.exr and out.json" in outcome.out
