@@ -38,7 +38,7 @@ def _cases() -> list[Any]:
         ("furnace_sphere", "path", "vegas"),
         ("sun_and_sky", "direct", "vegas"),
         ("open_sky", "prb_basic", "vegas"),
-        ("furnace_sphere", "ambient", "realnvp-logit"),
+        ("furnace_sphere", "ambient", "vegas"),
     }
     more = [
         (scene, nested, guide)
