@@ -205,7 +205,7 @@ def _within(listener: Listener | None, span: tuple[float, float]) -> Listener | 
 
 
 def share_layer(result: Result) -> Any:
-    """Share of the paths through each pixel that carried light, (H, W, 3), grey."""
+    """Share of the paths found through each pixel that carried light, (H, W, 3), grey."""
     share = result.nonzero / np.maximum(result.found, 1)
     return np.repeat(share.astype(np.float32)[..., None], 3, axis=2)
 

