@@ -19,7 +19,7 @@ from pssflow.study import harness, report
 from pssflow.study.harness import Scenery
 from pssflow.study.methods import _counted, named_method
 from pssflow.study.report import publish, with_error
-from pssflow.study.results import document
+from pssflow.study.results import _newest, document
 from pssflow.study.store import ALL, Store
 from pssflow.study.summary import cells, choices, overall, reaches
 from tests import scenes
@@ -280,6 +280,26 @@ def test_results_take_the_newest_settings_only(tmp_path, capfd):
     assert "6 rows of other settings" in capfd.readouterr().err
     assert not target.exists()
     assert Store(tmp_path / "page.csv").rows == kept
+
+
+def test_results_mix_no_settings_and_no_films(tmp_path):
+    """By samples, or with another reference, or of an edited scene: rows of one table are of one study."""
+    done = study(tmp_path, synthetic("none"), scenes=2, seeds=1)
+    old = done.run()
+    for change in (
+        {"unit": "spp"},
+        {"unit": "spp", "times": (1.0, 2.0)},
+        {"settings": {**done.settings, "reference_time": 9.0}},
+    ):
+        other = study(tmp_path / "other", synthetic("none"), scenes=1, seeds=1)
+        for name, value in change.items():
+            setattr(other, name, value)
+        new = [replace(row, when="9999-01-01T00:00:00Z") for row in other.run()]
+        assert _newest([*new, *old]) == (new, len(old))
+        (tmp_path / "other" / "results.csv").unlink()
+    films = [replace(r, when="9999-01-01T00:00:00Z", width=32) for r in old if r.scene == "scene 1"]
+    first = [row for row in old if row.scene == "scene 0"]
+    assert _newest([*films, *old]) == ([*films, *first], len(films))
 
 
 def test_results_of_nothing_are_one_line(tmp_path, capfd):

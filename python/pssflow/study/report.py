@@ -89,6 +89,7 @@ def publish(study: Study, rows: Sequence[Row], title: str) -> list[Any]:
     """
     if not rows:
         return []
+    any_row = rows[0]
     early = [row for row in rows if not row.spp]
     rows = [row for row in rows if row.spp]
     methods = [m.name for m in study.methods if any(row.method == m.name for row in rows)]
@@ -107,9 +108,9 @@ def publish(study: Study, rows: Sequence[Row], title: str) -> list[Any]:
         *too_early(early),
         *noisy_references(rows),
         *_failures(study),
-        *budgets(rows),
+        *budgets(rows or early),
         *([] if has_flip() else ["FLIP is not measured: the package flip-evaluator is missing"]),
-        *machine_lines([vars(row) for row in rows or early], rows[0].processor, rows[0].mitsuba),
+        *machine_lines([vars(row) for row in rows or early], any_row.processor, any_row.mitsuba),
     ]
     heading = title[0].upper() + title[1:]
     write_summary(study.folder / "summary.md", heading, sheets, [NOTES, *lines])

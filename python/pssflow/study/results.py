@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import click
 
@@ -48,15 +47,17 @@ def results(terminal: Terminal, folder: str, output: str) -> None:
 
 
 def _newest(rows: Sequence[Row]) -> tuple[list[Row], int]:
-    """Rows with the settings of the newest one, and how many have others."""
-
-    def settings(row: Row) -> tuple[Any, ...]:
-        return row.longest if row.unit == "s" else 0.0, row.unit, row.k, row.threads, row.version
-
+    """Rows of the newest one's study, of each scene those of its newest film, and how many others there are."""
     if not rows:
         return [], 0
-    own = settings(max(rows, key=lambda row: row.when))
-    kept = [row for row in rows if settings(row) == own]
+    by_age = sorted(rows, key=lambda row: row.when)
+    study = by_age[-1].study
+
+    def film(row: Row) -> tuple[str, int, int]:
+        return row.scene_hash, row.width, row.height
+
+    films = {row.scene: film(row) for row in by_age if row.study == study}
+    kept = [row for row in rows if row.study == study and film(row) == films[row.scene]]
     return kept, len(rows) - len(kept)
 
 
