@@ -246,7 +246,8 @@ def test_results_say_wins_and_losses_and_how_they_were_measured(tmp_path, capfd)
     # The best first.
     assert short.index("`better`") < short.index("`worse`")
     assert "**BIASED? off on scene 0" in short
-    assert "No method is biased" not in text
+    assert "8 pairs of scene and method were tested" in text
+    assert "Those that have it are named above." in text
     for told in (
         "one run of 4 s a seed",
         "snapshots at 1 s",

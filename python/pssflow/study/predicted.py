@@ -55,7 +55,8 @@ class HeldOut:
     def gain(self, guide: Guide, a: float) -> float:
         """V(1) ÷ V(a), the relative variance of random numbers ÷ that of the mixture a + (1 − a)·q; NaN without light.
 
-        V(a) = Σ over tiles of [mean of f_nee²/m_nee + f_bsdf²/m_bsdf + 2 f_nee f_bsdf m/(m_nee m_bsdf) − Ī²] ÷ (Ī² + ε).
+        V(a) = Σ over tiles of [mean of f_nee²/m_nee + f_bsdf²/m_bsdf + 2 f_nee f_bsdf m/(m_nee m_bsdf) − Ī²]
+        ÷ (Ī² + ε).
         """
         pilot = self.pilot
         nee, bsdf = (
@@ -92,7 +93,7 @@ class HeldOut:
 
     def densities(self, guide: Guide) -> Densities:
         """Of each path's numbers; without a BSDF-sampled ray its numbers have density 1."""
-        pilot, k = self.pilot, self.k
+        pilot = self.pilot
         rows = len(pilot.u)
 
         def q(decision: str, columns: slice, vertex: int) -> F64:

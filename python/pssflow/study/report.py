@@ -27,6 +27,7 @@ __all__ = [
     "NOTES",
     "Sheet",
     "bias_lines",
+    "bias_tested",
     "biased",
     "budgets",
     "choice_lines",
@@ -305,7 +306,8 @@ def bias_lines(floors: Mapping[tuple[str, str], Estimate], rows: Sequence[Row]) 
     was measured. Told beyond four standard errors (dozens are tested), and where it makes a twentieth of the relMSE.
     """
     lines = []
-    for (scene, method), floor in floors.items():
+    for scene, method in bias_tested(floors, rows):
+        floor = floors[scene, method]
         last = [
             row.relmse
             for row in rows
@@ -315,8 +317,6 @@ def bias_lines(floors: Mapping[tuple[str, str], Estimate], rows: Sequence[Row]) 
         base = floors.get((scene, BASELINE))
         if method == BASELINE or base is None:
             base = Estimate(0.0, 0.0)
-            if _reference_error(rows, scene) > NOISY_REFERENCE:
-                continue
         excess = Estimate(floor.value - base.value, math.hypot(floor.error, base.error))
         if excess.value > max(BIAS_ERRORS * excess.error, BIAS_SHARE * error):
             lines.append(
@@ -324,6 +324,18 @@ def bias_lines(floors: Mapping[tuple[str, str], Estimate], rows: Sequence[Row]) 
                 f"{with_error(excess)} in common, which is no noise"
             )
     return lines
+
+
+def bias_tested(
+    floors: Mapping[tuple[str, str], Estimate], rows: Sequence[Row]
+) -> list[tuple[str, str]]:
+    """Scene and method of what `bias_lines` tests: by a noisy reference only what stands beside random sampling."""
+    return [
+        (scene, method)
+        for scene, method in floors
+        if (method != BASELINE and (scene, BASELINE) in floors)
+        or _reference_error(rows, scene) <= NOISY_REFERENCE
+    ]
 
 
 def _reference_error(rows: Sequence[Row], scene: str) -> float:

@@ -94,11 +94,7 @@ def document(rows: Sequence[Row], folder: Path, table: str) -> str:
     errors = errors_sheet(found)
     picked = choices(found, competitors=OTHERS)
     warnings = [*bias_lines(known, measured), *too_early([row for row in rows if not row.spp])]
-    told = "No method is biased beyond four standard errors."
-    if not known:
-        told = "Bias was not tested: that takes two seeds, and the study's images."
-    elif any(line.startswith("BIASED?") for line in warnings):
-        told = ""
+    told = _bias_told(known, measured, any(line.startswith("BIASED?") for line in warnings))
     machine = machine_lines([vars(row) for row in rows], rows[0].processor, rows[0].mitsuba)
     paragraphs = [
         "# Results",
@@ -139,6 +135,27 @@ def document(rows: Sequence[Row], folder: Path, table: str) -> str:
         "\n".join(f"- {line}" for line in budgets(rows)),
     ]
     return "\n\n".join(part for part in paragraphs if part) + "\n"
+
+
+def _bias_told(known: Mapping[tuple[str, str], Estimate], rows: Sequence[Row], found: bool) -> str:
+    """How many pairs of scene and method were tested for bias, by which rule, and which were not."""
+    from .report import BIAS_ERRORS, BIAS_SHARE, bias_tested
+
+    tested = bias_tested(known, rows)
+    untested = [
+        f"{method} on {scene_title(scene)}"
+        for scene, method in dict.fromkeys((row.scene, row.method) for row in rows)
+        if (scene, method) not in tested
+    ]
+    if not tested:
+        return "Bias was not tested: that takes two seeds, and the study's images."
+    pairs = "1 pair" if len(tested) == 1 else f"{len(tested)} pairs"
+    told = (
+        f"{pairs} of scene and method were tested for what seeds err in common, beyond {BIAS_ERRORS:g} standard errors "
+        f"and beyond {100 * BIAS_SHARE:g} % of the method's relMSE at the longest budget; a smaller bias would not "
+        f"be seen. {'Those that have it are named above' if found else 'None has it'}."
+    )
+    return told + (f" Not tested: {', '.join(untested)}." if untested else "")
 
 
 def _conditions(rows: Sequence[Row], times: Sequence[float], seeds: int, unit: str) -> list[str]:
