@@ -226,7 +226,7 @@ def sums_sheet(total: Sequence[Overall], unit: str) -> Sheet:
         [
             o.method,
             f"{o.time:g} {unit}",
-            str(o.scenes),
+            o.of,
             with_error(o.mean),
             with_error(o.gain),
             f"{o.wins} / {o.ties} / {o.losses}",
@@ -273,12 +273,13 @@ def _charts(
         caption = f"{where}. Another quantity than in the other charts, hence not to be compared with them."
         error_chart(path, heading, everything, methods, caption=caption)
         charts.append(Chart(path.with_suffix(".svg"), heading))
+    known = methods
     methods = [method for method in methods if any(row.method == method for row in rows)]
     if any(method != BASELINE for method in methods) and any(c.gained for c in found):
         path = study.folder / "ratio.png"
         heading = f"Gain over random sampling: {title}"
         bars = f"Bars: two standard errors over {seeds}. {rows[0].processor}."
-        ratio_chart(path, heading, found, total, methods, caption=bars)
+        ratio_chart(path, heading, found, total, methods, known=known, caption=bars)
         charts.insert(1, Chart(path.with_suffix(".svg"), heading, first=True))
     return charts
 
@@ -398,7 +399,7 @@ def machine_lines(
     """Processor, load and commit of runs that have `load_before`, `load_after` and `commit`; crowds are told first."""
     loads = [max(run["load_before"], run["load_after"]) for run in ran]
     commits = ", ".join(sorted({run["commit"] for run in ran}))
-    mean, cores = sum(loads) / len(loads), os.cpu_count() or 1
+    mean, cores = sum(loads) / len(loads), _cores(processor)
     lines = [
         f"{processor}; load average up to {max(loads):.1f}, in the mean {mean:.1f}; "
         f"commit {commits}{'' if mitsuba is None else f'; Mitsuba {mitsuba}'}."
@@ -410,6 +411,12 @@ def machine_lines(
             "methods share a machine in different ways, so that ratios at equal time are not to be trusted",
         )
     return lines
+
+
+def _cores(processor: str) -> int:
+    """Of the machine that was measured on, as `store.processor` names it: the page may be written on another."""
+    number = processor.partition(" ×")[0]
+    return int(number) if number.isdigit() else os.cpu_count() or 1
 
 
 def too_early(early: Sequence[Row]) -> list[str]:

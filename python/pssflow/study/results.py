@@ -190,7 +190,7 @@ def _short(total: Sequence[Overall], time: float, unit: str) -> list[str]:
     last = sorted((o for o in total if o.time == time), key=lambda o: -o.mean.value)
     return [
         f"`{o.method}`: {with_error(o.mean)} times as good as random sampling at {time:g} {unit}, in the geometric "
-        f"mean of {o.scenes} scenes; {o.wins} won, {o.ties} tied, {o.losses} lost; worst on {scene_title(o.worst[0])}, "
+        f"mean (scenes: {o.of}); {o.wins} won, {o.ties} tied, {o.losses} lost; worst on {scene_title(o.worst[0])}, "
         f"{with_error(o.worst[1])}"
         for o in last
     ]
@@ -204,7 +204,11 @@ def _matrix(found: Sequence[Cell], total: Sequence[Overall], time: float) -> str
         text = with_error(cell.gained)
         return f"**{text}** {cell.verdict}" if cell.verdict in ("win", "loss") else text
 
-    means = {o.method: with_error(o.mean) for o in total if o.time == time}
+    means = {
+        o.method: with_error(o.mean) + (f" ({o.of})" if o.left_out else "")
+        for o in total
+        if o.time == time
+    }
     return _by_scene(found, time, shown, means)
 
 
