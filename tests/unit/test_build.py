@@ -57,6 +57,7 @@ def test_make_help_lists_every_target() -> None:
             "study-speed-accuracy",
             "study-thesis",
             "study-capacity",
+            "study-stability",
             "results",
             "study-stability",
             "docs",

@@ -19,7 +19,7 @@ from pssflow.study import harness, report
 from pssflow.study.harness import Scenery
 from pssflow.study.methods import _counted, named_method
 from pssflow.study.report import publish, with_error
-from pssflow.study.results import document
+from pssflow.study.results import _newest, document
 from pssflow.study.store import ALL, Store
 from pssflow.study.summary import cells, choices, overall, reaches
 from tests import scenes
@@ -94,7 +94,7 @@ def test_the_local_scale_knows_nothing_of_its_pixel():
 def test_mitsubas_passes_end_at_each_number_of_samples():
     """A pass size that divides both budgets, at least two passes to the first one; seeds of its own."""
     scene: Any = type("Film", (), {"width": 2, "height": 2})
-    render = FakePass([0.0], [0.1])
+    render = FakePass([0.0], [0.1], jit=False)
     first, last = _counted(render, "fake", 1, scene, (12.0, 30.0), None)  # pyright: ignore[reportArgumentType]
     assert (first.spp, last.spp) == (12, 30)
     assert first.variance is not None
@@ -102,6 +102,40 @@ def test_mitsubas_passes_end_at_each_number_of_samples():
     assert min(render.seeds) == 2 << 20
     (single,) = _counted(FakePass([0.0], [0.1]), "fake", 0, scene, (2.0,), None)  # pyright: ignore[reportArgumentType]
     assert single.spp == 2
+
+
+def test_by_samples_compiling_is_outside_of_the_seconds():
+    """A pass of its own comes first, with a number that no other pass has, and is told as warm-up."""
+    scene: Any = type("Film", (), {"width": 2, "height": 2})
+    render = FakePass([0.0], [0.1])
+    (shot,) = _counted(render, "fake", 1, scene, (2.0,), None)  # pyright: ignore[reportArgumentType]
+    assert render.seeds == [(2 << 20) - 1, 2 << 20, (2 << 20) + 1]
+    assert shot.spp == 2
+    assert set(shot.seconds) == {"render", "warm_up"}
+    assert shot.elapsed == shot.seconds["render"]
+
+
+def test_a_mean_says_which_scenes_it_leaves_out(tmp_path):
+    """A method whose error drowns in the reference's noise on one scene has no ratio there."""
+    rows = study(tmp_path, synthetic("none"), synthetic("better", noise=0.5)).run()
+    drowned = [
+        replace(row, relmse=-1e-6) if (row.scene, row.method) == ("scene 1", "better") else row
+        for row in rows
+    ]
+    total = overall(cells(drowned))
+    assert [o.of for o in total] == ["1 of 2; below the noise on scene 1"] * 2
+    assert [o.of for o in overall(cells(rows))] == ["2", "2"]
+    text = document(drowned, tmp_path, "results.csv")
+    assert (
+        "1 of 2; below the noise on scene 1" in text.partition("## In short")[2].partition("##")[0]
+    )
+    assert f"{with_error(total[-1].mean)} (1 of 2; below the noise on scene 1)" in text
+
+
+def test_a_crowd_is_judged_by_the_cores_of_the_measured_machine():
+    ran = [{"load_before": 5.0, "load_after": 6.0, "commit": "abc"}]
+    assert report.machine_lines(ran, "2 × A CPU")[0].startswith("CROWDED: with a load of 6.0 on 2")
+    assert len(report.machine_lines(ran, "64 × A CPU")) == 1
 
 
 def test_by_samples_it_is_the_samples_that_decide(tmp_path):
@@ -246,7 +280,8 @@ def test_results_say_wins_and_losses_and_how_they_were_measured(tmp_path, capfd)
     # The best first.
     assert short.index("`better`") < short.index("`worse`")
     assert "**BIASED? off on scene 0" in short
-    assert "No method is biased" not in text
+    assert "8 pairs of scene and method were tested" in text
+    assert "Those that have it are named above." in text
     for told in (
         "one run of 4 s a seed",
         "snapshots at 1 s",
@@ -280,6 +315,26 @@ def test_results_take_the_newest_settings_only(tmp_path, capfd):
     assert "6 rows of other settings" in capfd.readouterr().err
     assert not target.exists()
     assert Store(tmp_path / "page.csv").rows == kept
+
+
+def test_results_mix_no_settings_and_no_films(tmp_path):
+    """By samples, or with another reference, or of an edited scene: rows of one table are of one study."""
+    done = study(tmp_path, synthetic("none"), scenes=2, seeds=1)
+    old = done.run()
+    for change in (
+        {"unit": "spp"},
+        {"unit": "spp", "times": (1.0, 2.0)},
+        {"settings": {**done.settings, "reference_time": 9.0}},
+    ):
+        other = study(tmp_path / "other", synthetic("none"), scenes=1, seeds=1)
+        for name, value in change.items():
+            setattr(other, name, value)
+        new = [replace(row, when="9999-01-01T00:00:00Z") for row in other.run()]
+        assert _newest([*new, *old]) == (new, len(old))
+        (tmp_path / "other" / "results.csv").unlink()
+    films = [replace(r, when="9999-01-01T00:00:00Z", width=32) for r in old if r.scene == "scene 1"]
+    first = [row for row in old if row.scene == "scene 0"]
+    assert _newest([*films, *old]) == ([*films, *first], len(films))
 
 
 def test_results_of_nothing_are_one_line(tmp_path, capfd):

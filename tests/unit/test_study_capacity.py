@@ -32,26 +32,37 @@ def _quick(monkeypatch) -> None:
 @pytest.fixture(scope="module")
 def room() -> pssflow.Scene:
     """Small, with one lamp: what guides are for."""
+    return opened("door-ajar")
+
+
+def opened(name: str) -> pssflow.Scene:
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    return pssflow.Scene(str(ROOT / "scenes" / "door-ajar" / "scene.xml"), size=(48, 48))
+    return pssflow.Scene(str(ROOT / "scenes" / name / "scene.xml"), size=(48, 48))
 
 
-@pytest.mark.parametrize("guide", ["table", "realnvp-logit", "direction-table"])
+@pytest.mark.parametrize("guide", ["table", "realnvp-logit", "direction-table", "ray-table"])
 def test_densities_integrate_to_one(room, guide):
     """Over uniform paths the mean of q is 1, within its own standard error, of all numbers and of the directions'."""
     held = HeldOut.of(room, 2, paths=60_000)
     assert len(held.pilot.u) == pytest.approx(60_000, rel=0.05)
     options = {"epochs": 2} if guide == "realnvp-logit" else {}
     fitted = room.pilot(32, seed=5).fit(guide, **options)
-    for q in held.densities(fitted):
+    densities = held.densities(fitted)
+    for q in densities:
         assert q.min() >= 0.0
-        assert abs(q.mean() - 1.0) < 5 * q.std() / len(q) ** 0.5
+        assert abs(q.mean() - 1.0) <= 5 * q.std() / len(q) ** 0.5
+    assert bool(np.any(densities.both != densities.nee)) == ("ray" in fitted.models)
 
 
-def test_the_gain_is_one_at_a_of_one_and_what_rendering_shows_elsewhere(room):
-    """A render from the same guide: its variance is what held-out paths foretell, by the spread of both."""
+@pytest.mark.parametrize(("name", "least"), [("door-ajar", 1.5), ("leaves", 1.0)])
+def test_the_gain_is_one_at_a_of_one_and_what_rendering_shows_elsewhere(name, least):
+    """A render from the same guide: its variance is what held-out paths foretell, by the spread of both.
+
+    In `leaves` nearly all variance lies in the BSDF-sampled term.
+    """
+    room = opened(name)
     held = HeldOut.of(room, 2, paths=400_000)
     fitted = room.pilot(64, seed=5).fit("table")
     assert held.gain(fitted, 1.0) == pytest.approx(1.0)
@@ -65,8 +76,16 @@ def test_the_gain_is_one_at_a_of_one_and_what_rendering_shows_elsewhere(room):
     variances = [np.mean([r.variance / scale for r in of]) for of in images]
     # Tiles hold what pixels differ by, which no guide removes: foretold gains are on the careful side.
     measured = float(variances[0] / variances[1])
-    assert 1.5 < foretold < 1.5 * measured
+    assert least < foretold < 1.5 * measured
     assert foretold > 0.3 * measured
+
+
+def test_a_gain_holds_what_the_ray_of_the_last_vertex_gains():
+    """In `courtyard` renders of 64 spp show 1.37 times the gain with `ray-table`."""
+    room = opened("courtyard")
+    held, pilot = HeldOut.of(room, 2, paths=400_000), room.pilot(64, seed=5)
+    without = pilot.fit("direction-table+emitter-table+light-table")
+    assert held.gain(pilot.fit("table"), 0.1) > 1.15 * held.gain(without, 0.1)
 
 
 def test_a_black_scene_foretells_nothing(llvm_variant):

@@ -11,7 +11,7 @@ import pytest
 
 from pssflow import metrics
 from pssflow.cli import main
-from pssflow.reference import Reference
+from pssflow.reference import Reference, read_exr
 from pssflow.study import harness, report
 from pssflow.study.harness import Case, Method, Scenery, Shot, Study
 from pssflow.study.report import biased, publish
@@ -268,6 +268,36 @@ def test_a_method_without_an_image_yet_says_so(tmp_path):
     again.methods = [*again.methods, replace(never, run=lambda *a: calls.append(1) or [])]
     again.run()
     assert not calls
+
+
+def test_a_study_of_methods_without_any_image_is_published(tmp_path):
+    never = Method("never", lambda *a: [])
+    done = study(tmp_path, never, scenes=1)
+    lines = publish(done, done.run(), "synthetic")
+    assert "no image yet: never on scene 0 at 1, 4 s" in lines
+    assert lines[-1].startswith("wrote ")
+
+
+def test_every_film_has_a_truth_of_its_own(tmp_path):
+    """Another size under the same name, stopped at its first run: kept rows are shown with their own truth."""
+    first = study(tmp_path, synthetic("none"), scenes=1)
+    rows = first.run()
+    before = first.floors()
+    small = replace(truth(), image=truth().image[:32] + 1.0, variance=truth().variance[:32])
+    other = study(tmp_path, synthetic("none"), scenes=1)
+    case = Case(digest="flat", scene=None, truth=lambda: small)
+    other.sceneries = [Scenery("scene 0", lambda: case)]
+    other.settings = {**other.settings, "pixels": 2048}
+
+    def stop(scene, seed, times, progress):
+        raise KeyboardInterrupt
+
+    other.methods = [replace(synthetic("none"), run=stop)]
+    with pytest.raises(KeyboardInterrupt):
+        other.run()
+    assert first.floors() == before
+    assert read_exr(first.reference_path(rows[0])).image.shape == TRUTH.shape
+    publish(first, rows, "synthetic")
 
 
 @pytest.mark.parametrize(

@@ -104,7 +104,7 @@ def test_images_and_errors_are_those_of_the_exrs(done, text):
     assert [len(scene["views"]) for scene in data["scenes"]] == [7, 7]  # a reference, 3 × 2 times
     scene = data["scenes"][0]
     views = {(view["name"], view["time"]): view for view in scene["views"]}
-    truth = read_exr(done.reference_path("scene 0")).image
+    truth = read_exr(done.reference_path(done.rows[0])).image
     row = next(r for r in done.rows if (r.method, r.seed, r.time) == ("none", 0, 4.0))
     image = read_exr(done.image_path(row)).image
     view = views["none", 4.0]

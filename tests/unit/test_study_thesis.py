@@ -15,7 +15,7 @@ import pytest
 
 from pssflow import Guide
 from pssflow.cli import main
-from pssflow.study import thesis_flow, thesis_report, thesis_tests
+from pssflow.study import thesis_findings, thesis_flow, thesis_report, thesis_tests
 from pssflow.study.latent import Latent
 from pssflow.study.parts import Parts
 from pssflow.study.sceneries import named_scenes
@@ -116,6 +116,44 @@ def test_side_by_side_keeps_the_order_and_stops_the_others():
     with pytest.raises(ValueError, match="the first"):
         side_by_side(work, range(2))
     assert stopped in ([], [True])  # never begun on one core, told on two
+
+
+def test_side_by_side_raises_what_failed_first():
+    """The last case fails, and those before it end with errors of their own because they are stopped."""
+
+    def work(case: int, stop: threading.Event) -> None:
+        if case == 1:
+            raise ValueError("the last")
+        if stop.wait(20.0):
+            raise RuntimeError("fit was stopped at 3%")
+
+    with pytest.raises(ValueError, match="the last"):
+        side_by_side(work, range(2))
+
+
+@pytest.mark.parametrize(
+    ("theirs", "told"),
+    [
+        (3.3, "none of the changes tried raises it by a tenth; none of them alone explains it"),
+        (0.5, "What lowers it, a single training each, of one seed: no resampling: 0.54; “no resampling” alone"),
+        (1.15, "raises it by a tenth; “through a logit” alone would explain it"),
+    ],
+)  # fmt: skip
+def test_a_ratio_on_either_side_of_the_thesis_is_explained(theirs, told):
+    found = [
+        thesis_tests.Found(
+            next(e for e in EXPERIMENTS if e.name == name),
+            "bsdf",
+            {"per_ray": 0.1 * ratio, "random_per_ray": 0.1, "surfaces": 0.7}
+            | {"mass_outside": 0.2, "loss": -1.0},
+        )
+        for name, ratio in (
+            ("as in the thesis", 1.0), ("no resampling", 0.54), ("through a logit", 1.09)
+        )
+    ]  # fmt: skip
+    text = thesis_findings._told(found, 1.0, theirs)
+    assert told in text
+    assert ("could pass 7" in text) == (theirs > 1.0)
 
 
 def test_a_fit_ends_when_it_is_told():

@@ -15,6 +15,7 @@ import click
 
 from ..params import Positive
 from ..terminal import Terminal
+from .guides import NET
 from .times import Samples
 
 if TYPE_CHECKING:
@@ -45,7 +46,7 @@ class Family:
 FAMILIES = (
     Family("table depth", "table", "depth", (0, 1, 2, 3, 4, 5)),
     Family("table bins", "table", "bins", (4, 8, 16, 32), {"depth": 4}),
-    Family("net width", "mixture-net+emitter-table+light-table", "hidden", (4, 8, 16, 32, 64)),
+    Family("net width", NET, "hidden", (4, 8, 16, 32, 64)),
     Family("flow couplings", "realnvp-logit", "couplings", (1, 2, 4, 8)),
 )
 

@@ -23,7 +23,8 @@ Parameters: numbers that the last fit learned, mean over seeds; of tables those 
 relative to the square of the reference about each pixel, the reference's own variance subtracted. Ratios are random
 sampling (none) ÷ the model: above 1 is a gain. predicted: variance per path on held-out paths, by the rule of `auto`,
 of the guide that drew last; gain / path: the images' own variance, pilot and early passes inside; equal budget: relMSE
-at equal time, or samples. training: seconds, all fits. ± is one standard error over seeds."""
+at equal time, or samples. training: seconds, all fits. ± is one standard error over seeds. A
+flow over the path (realnvp-logit) does not model the BSDF-sampled ray at the last vertex; table and net do."""
 
 CLOSE = 1.1
 """A model is enough if its error at equal budget is at most that times the least."""

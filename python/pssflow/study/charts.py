@@ -97,9 +97,13 @@ def ratio_chart(
     found: Sequence[Cell],
     summary: Sequence[Overall],
     methods: Sequence[str],
+    *,
+    known: Sequence[str] | None = None,
     caption: str = "",
 ) -> list[Path]:
     """Ratios to random sampling at equal time by scene, and their geometric mean; bars of two standard errors.
+
+    Colours are those of the methods in `known`, as in the study's other charts.
 
     Raises:
         OSError: a file cannot be written.
@@ -109,6 +113,7 @@ def ratio_chart(
     times = sorted({cell.time for cell in found})
     scenes = list(dict.fromkeys(cell.scene for cell in found))
     others = [method for method in methods if method != BASELINE]
+    known = known or methods
     labels = [*(scene_title(scene) for scene in scenes), "geometric mean"]
     height = 0.16 * max(len(others), 2) + 0.1
     figure = new_figure(3.6 * len(times) + 1.6, height * len(labels) + 2.2)
@@ -136,7 +141,7 @@ def ratio_chart(
                 values,
                 [row + offset for row, _ in points],
                 xerr=list(zip(*bars, strict=True)),
-                **style(methods, method) | {"linestyle": "none"},
+                **style(known, method) | {"linestyle": "none"},
                 markersize=5,
                 elinewidth=1.2,
                 capsize=2,
@@ -161,7 +166,7 @@ def ratio_chart(
     # All panels share their axis, whose ends are known only now.
     for axes in figure.axes:
         plain_ticks(axes.xaxis)
-    return finish(figure, path, title, _legend_handles(others, methods), caption)
+    return finish(figure, path, title, _legend_handles(others, known), caption)
 
 
 def _curve(axes: Any, rows: Sequence[Row], measure: str, look: dict[str, Any]) -> None:

@@ -8,6 +8,7 @@ not shown.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import os
@@ -228,12 +229,14 @@ class Study:
         self.say(f"{name}: Mitsuba's reference, unless it is cached")
         try:
             truth = case.truth()
-            truth.write(reference_path(self.folder, name))
             case.warm_up()
         except FAILURES as error:
             self._leave_out(name, error)
             clock.skip(len(missing))
             return False
+        size = truth.image.shape[1], truth.image.shape[0]
+        k = self.settings["k"]
+        truth.write(reference_path(self.folder, name, case.digest, k, size, scenery.light))
         for method, seed, key in missing:
             failure = f"{method.name} on {name}"
             if failure in self.failures:
@@ -251,7 +254,6 @@ class Study:
             except FAILURES as error:
                 self._leave_out(failure, error)
                 continue
-            size = truth.image.shape[1], truth.image.shape[0]
             self.store.put(
                 found.get(time) or nothing_yet(time, size, truth, common) for time in self.times
             )
@@ -274,6 +276,9 @@ class Study:
             "threads": self.settings["threads"],
             "options": json.dumps(dict(method.options), sort_keys=True),
             "configuration": key,
+            "study": configuration(
+                times=list(self.times), unit=self.unit, settings=dict(self.settings)
+            ),
             "commit": commit(),
             "version": _core.__version__,
             "mitsuba": mi.__version__,
@@ -296,9 +301,9 @@ class Study:
         """Where a row's image lies; of seeds after the first only the last one is kept."""
         return image_path(self.folder, row.scene, row.method, row.seed, row.time, row.unit)
 
-    def reference_path(self, scene: str) -> Path:
-        """Where a scene's truth lies."""
-        return reference_path(self.folder, scene)
+    def reference_path(self, row: Row) -> Path:
+        """Where the truth that a row was measured against lies."""
+        return truth_path(self.folder, row)
 
     def floors(self) -> dict[tuple[str, str], metrics.Estimate]:
         """See `floors`; of this study's rows."""
@@ -320,7 +325,7 @@ def floors(
     for scene, method in dict.fromkeys((row.scene, row.method) for row in last):
         own = [row for row in last if (row.scene, row.method) == (scene, method)]
         paths = [image_path(folder, scene, method, row.seed, row.time, row.unit) for row in own]
-        place = reference_path(folder, scene)
+        place = truth_path(folder, own[-1])
         if len(own) < seeds or not all(path.is_file() for path in (*paths, place)):
             continue
         if scene not in truths:
@@ -414,9 +419,19 @@ def image_path(
     return folder / "images" / f"{name}.exr"
 
 
-def reference_path(folder: Path, scene: str) -> Path:
-    """Where a scene's truth lies."""
-    return folder / "images" / f"{file_name(scene)}-reference.exr"
+def reference_path(
+    folder: Path, scene: str, digest: str, k: int, size: tuple[int, int], light: str
+) -> Path:
+    """Where a scene's truth lies: another scene of that name, another film or other light has a file of its own."""
+    text = json.dumps([digest, k, *size, light])
+    short = hashlib.sha256(text.encode()).hexdigest()[:8]
+    return folder / "images" / f"{file_name(scene)}-reference-{short}.exr"
+
+
+def truth_path(folder: Path, row: Row) -> Path:
+    """Where the truth that a row was measured against lies."""
+    size = row.width, row.height
+    return reference_path(folder, row.scene, row.scene_hash, row.k, size, row.light)
 
 
 def file_name(name: str) -> str:

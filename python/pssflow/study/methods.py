@@ -221,7 +221,7 @@ def _mitsuba(name: str, variant: str, k: int, threads: int | None, unit: str) ->
         name,
         run,
         options,
-        budget="all samples of the render" if unit == "spp" else budget,
+        budget="all samples of the render; compiling outside" if unit == "spp" else budget,
         light=ALL if name == PATH else BOUNCES,
     )
 
@@ -242,9 +242,13 @@ def _counted(
     # All passes are of one size, and end at each budget.
     spp = max(size for size in range(1, most + 1) if common % size == 0)
     state = Running.empty([scene.width, scene.height], spp)
+    first = (seed + 1) << 20
+    start = time.perf_counter()
+    if render.jit:
+        render(first - 1, spp)  # the first pass compiles
+    warm_up = time.perf_counter() - start
     start = time.perf_counter()
     shots = []
-    first = (seed + 1) << 20
     for budget in wanted:
         while state.spp < budget:
             image, drawn, bad = render(first + state.passes, spp)
@@ -252,7 +256,8 @@ def _counted(
             if listener is not None:
                 listener("render", state.spp / wanted[-1])
         elapsed = time.perf_counter() - start
-        shots.append(_shot(state, budget, elapsed, name, {"render": elapsed}))
+        seconds = {"render": elapsed, "warm_up": warm_up}
+        shots.append(_shot(state, budget, elapsed, name, seconds))
     return shots
 
 

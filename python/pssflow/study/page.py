@@ -128,8 +128,7 @@ def study_scenes(study: Study, rows: Sequence[Row]) -> list[dict[str, Any]]:
     scenes = []
     for scenery in study.sceneries:
         own = [row for row in shown if row.scene == scenery.name]
-        place = study.reference_path(scenery.name)
-        if own and place.is_file():
+        if own and (place := study.reference_path(own[0])).is_file():
             scenes.append(
                 viewer_scene(scene_title(scenery.name), read_exr(place), _views(study, own))
             )

@@ -7,6 +7,7 @@ those of `rust/pss-guide/src/predict.rs`, without the standard error that makes 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,12 +15,23 @@ from numpy.typing import NDArray
 from ..guide import LUMINANCE, Guide
 from ..scene import Pilot, Scene
 
-__all__ = ["HeldOut"]
+__all__ = ["Densities", "HeldOut"]
 
 F64 = NDArray[np.float64]
 
 SIDE = 16
 """Tiles along an axis of the image."""
+
+
+class Densities(NamedTuple):
+    """A guide's densities of some paths' numbers, (n,) each."""
+
+    nee: F64
+    """Of the numbers that f_nee uses."""
+    bsdf: F64
+    """Of those that the BSDF-sampled term uses: the directions' and the ray's."""
+    both: F64
+    """Of all."""
 
 
 @dataclass(frozen=True)
@@ -43,8 +55,8 @@ class HeldOut:
     def gain(self, guide: Guide, a: float) -> float:
         """V(1) ÷ V(a), the relative variance of random numbers ÷ that of the mixture a + (1 − a)·q; NaN without light.
 
-        V(a) = Σ over tiles of [mean of f_nee²/m + (2 f_nee f_bsdf + f_bsdf²)/m′ − Ī²] ÷ (Ī² + ε), with the directions'
-        marginal m′.
+        V(a) = Σ over tiles of [mean of f_nee²/m_nee + f_bsdf²/m_bsdf + 2 f_nee f_bsdf m/(m_nee m_bsdf) − Ī²]
+        ÷ (Ī² + ε).
         """
         pilot = self.pilot
         nee, bsdf = (
@@ -66,18 +78,22 @@ class HeldOut:
         square = (each * first**2 - second) / (each - 1)
         scale = 1.0 / (first**2 + (0.1 * first.mean()) ** 2)
 
-        def variance(m: F64, marginal: F64) -> float:
-            moment = mean(nee**2 / m + (2.0 * nee * bsdf + bsdf**2) / marginal)
+        def variance(q: Densities, a: float) -> float:
+            m_nee, m_bsdf, m = (a + (1.0 - a) * own for own in q)
+            with np.errstate(invalid="ignore"):
+                # Where densities are infinite nothing is left of either term: ∞/∞ is 0 here.
+                cross = np.fmax(m / (m_nee * m_bsdf), 0.0)
+            moment = mean(nee**2 / m_nee + bsdf**2 / m_bsdf + 2.0 * nee * bsdf * cross)
             return float(((moment - square) * scale).sum())
 
-        all_of, directions = self.densities(guide)
         one = np.ones(len(nee))
-        mixed = variance(a + (1.0 - a) * all_of, a + (1.0 - a) * directions)
-        return variance(one, one) / mixed if mixed > 0.0 else float("nan")
+        uniform = variance(Densities(one, one, one), 1.0)
+        mixed = variance(self.densities(guide), a) if a < 1.0 else uniform
+        return uniform / mixed if mixed > 0.0 else float("nan")
 
-    def densities(self, guide: Guide) -> tuple[F64, F64]:
-        """Q of all numbers of each path, and of those that the BSDF-sampled term uses, (n,)."""
-        pilot, k = self.pilot, self.k
+    def densities(self, guide: Guide) -> Densities:
+        """Of each path's numbers; without a BSDF-sampled ray its numbers have density 1."""
+        pilot = self.pilot
         rows = len(pilot.u)
 
         def q(decision: str, columns: slice, vertex: int) -> F64:
@@ -94,15 +110,25 @@ class HeldOut:
                 ).astype(np.float64)
             )
 
-        if "path" in guide.models:
-            whole = q("path", slice(0, 2 * k + 1), 0)
-            return whole, whole
-        directions, rest = np.ones(rows), np.ones(rows)
-        if "direction" in guide.models:
-            for b in range(k - 1):
-                directions *= q("direction", slice(2 * b, 2 * b + 2), b)
-        if "emitter" in guide.models:
-            rest *= q("emitter", slice(2 * k - 2, 2 * k - 1), k - 1)
-        if "light" in guide.models:
-            rest *= q("light", slice(2 * k - 1, 2 * k + 1), k - 1)
-        return directions * rest, directions
+        nee, bsdf, both = np.ones(rows), np.ones(rows), np.ones(rows)
+        for decision in guide.models:
+            for vertex, columns in self._columns(decision):
+                own = q(decision, columns, vertex)
+                both *= own
+                if decision != "ray":
+                    nee *= own
+                if decision not in ("emitter", "light"):
+                    bsdf *= own
+        return Densities(nee, bsdf, both)
+
+    def _columns(self, decision: str) -> list[tuple[int, slice]]:
+        """Where a decision is taken: vertices, counted from 0, and the columns of u."""
+        k, learned = self.k, self.pilot.learned
+        places = {
+            "path": [(0, slice(0, learned))],
+            "direction": [(b, slice(2 * b, 2 * b + 2)) for b in range(k - 1)],
+            "emitter": [(k - 1, slice(2 * k - 2, 2 * k - 1))],
+            "light": [(k - 1, slice(2 * k - 1, 2 * k + 1))],
+            "ray": [(k - 1, slice(learned, learned + 2))],
+        }
+        return [at for at in places[decision] if at[1].stop <= self.pilot.u.shape[1]]

@@ -27,6 +27,7 @@ __all__ = [
     "NOTES",
     "Sheet",
     "bias_lines",
+    "bias_tested",
     "biased",
     "budgets",
     "choice_lines",
@@ -89,6 +90,7 @@ def publish(study: Study, rows: Sequence[Row], title: str) -> list[Any]:
     """
     if not rows:
         return []
+    any_row = rows[0]
     early = [row for row in rows if not row.spp]
     rows = [row for row in rows if row.spp]
     methods = [m.name for m in study.methods if any(row.method == m.name for row in rows)]
@@ -107,9 +109,9 @@ def publish(study: Study, rows: Sequence[Row], title: str) -> list[Any]:
         *too_early(early),
         *noisy_references(rows),
         *_failures(study),
-        *budgets(rows),
+        *budgets(rows or early),
         *([] if has_flip() else ["FLIP is not measured: the package flip-evaluator is missing"]),
-        *machine_lines([vars(row) for row in rows or early], rows[0].processor, rows[0].mitsuba),
+        *machine_lines([vars(row) for row in rows or early], any_row.processor, any_row.mitsuba),
     ]
     heading = title[0].upper() + title[1:]
     write_summary(study.folder / "summary.md", heading, sheets, [NOTES, *lines])
@@ -224,7 +226,7 @@ def sums_sheet(total: Sequence[Overall], unit: str) -> Sheet:
         [
             o.method,
             f"{o.time:g} {unit}",
-            str(o.scenes),
+            o.of,
             with_error(o.mean),
             with_error(o.gain),
             f"{o.wins} / {o.ties} / {o.losses}",
@@ -271,12 +273,13 @@ def _charts(
         caption = f"{where}. Another quantity than in the other charts, hence not to be compared with them."
         error_chart(path, heading, everything, methods, caption=caption)
         charts.append(Chart(path.with_suffix(".svg"), heading))
+    known = methods
     methods = [method for method in methods if any(row.method == method for row in rows)]
     if any(method != BASELINE for method in methods) and any(c.gained for c in found):
         path = study.folder / "ratio.png"
         heading = f"Gain over random sampling: {title}"
         bars = f"Bars: two standard errors over {seeds}. {rows[0].processor}."
-        ratio_chart(path, heading, found, total, methods, caption=bars)
+        ratio_chart(path, heading, found, total, methods, known=known, caption=bars)
         charts.insert(1, Chart(path.with_suffix(".svg"), heading, first=True))
     return charts
 
@@ -304,7 +307,8 @@ def bias_lines(floors: Mapping[tuple[str, str], Estimate], rows: Sequence[Row]) 
     was measured. Told beyond four standard errors (dozens are tested), and where it makes a twentieth of the relMSE.
     """
     lines = []
-    for (scene, method), floor in floors.items():
+    for scene, method in bias_tested(floors, rows):
+        floor = floors[scene, method]
         last = [
             row.relmse
             for row in rows
@@ -314,8 +318,6 @@ def bias_lines(floors: Mapping[tuple[str, str], Estimate], rows: Sequence[Row]) 
         base = floors.get((scene, BASELINE))
         if method == BASELINE or base is None:
             base = Estimate(0.0, 0.0)
-            if _reference_error(rows, scene) > NOISY_REFERENCE:
-                continue
         excess = Estimate(floor.value - base.value, math.hypot(floor.error, base.error))
         if excess.value > max(BIAS_ERRORS * excess.error, BIAS_SHARE * error):
             lines.append(
@@ -323,6 +325,18 @@ def bias_lines(floors: Mapping[tuple[str, str], Estimate], rows: Sequence[Row]) 
                 f"{with_error(excess)} in common, which is no noise"
             )
     return lines
+
+
+def bias_tested(
+    floors: Mapping[tuple[str, str], Estimate], rows: Sequence[Row]
+) -> list[tuple[str, str]]:
+    """Scene and method of what `bias_lines` tests: by a noisy reference only what stands beside random sampling."""
+    return [
+        (scene, method)
+        for scene, method in floors
+        if (method != BASELINE and (scene, BASELINE) in floors)
+        or _reference_error(rows, scene) <= NOISY_REFERENCE
+    ]
 
 
 def _reference_error(rows: Sequence[Row], scene: str) -> float:
@@ -385,7 +399,7 @@ def machine_lines(
     """Processor, load and commit of runs that have `load_before`, `load_after` and `commit`; crowds are told first."""
     loads = [max(run["load_before"], run["load_after"]) for run in ran]
     commits = ", ".join(sorted({run["commit"] for run in ran}))
-    mean, cores = sum(loads) / len(loads), os.cpu_count() or 1
+    mean, cores = sum(loads) / len(loads), _cores(processor)
     lines = [
         f"{processor}; load average up to {max(loads):.1f}, in the mean {mean:.1f}; "
         f"commit {commits}{'' if mitsuba is None else f'; Mitsuba {mitsuba}'}."
@@ -397,6 +411,12 @@ def machine_lines(
             "methods share a machine in different ways, so that ratios at equal time are not to be trusted",
         )
     return lines
+
+
+def _cores(processor: str) -> int:
+    """Of the machine that was measured on, as `store.processor` names it: the page may be written on another."""
+    number = processor.partition(" ×")[0]
+    return int(number) if number.isdigit() else os.cpu_count() or 1
 
 
 def too_early(early: Sequence[Row]) -> list[str]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import click
 
@@ -48,15 +47,17 @@ def results(terminal: Terminal, folder: str, output: str) -> None:
 
 
 def _newest(rows: Sequence[Row]) -> tuple[list[Row], int]:
-    """Rows with the settings of the newest one, and how many have others."""
-
-    def settings(row: Row) -> tuple[Any, ...]:
-        return row.longest if row.unit == "s" else 0.0, row.unit, row.k, row.threads, row.version
-
+    """Rows of the newest one's study, of each scene those of its newest film, and how many others there are."""
     if not rows:
         return [], 0
-    own = settings(max(rows, key=lambda row: row.when))
-    kept = [row for row in rows if settings(row) == own]
+    by_age = sorted(rows, key=lambda row: row.when)
+    study = by_age[-1].study
+
+    def film(row: Row) -> tuple[str, int, int]:
+        return row.scene_hash, row.width, row.height
+
+    films = {row.scene: film(row) for row in by_age if row.study == study}
+    kept = [row for row in rows if row.study == study and film(row) == films[row.scene]]
     return kept, len(rows) - len(kept)
 
 
@@ -93,11 +94,7 @@ def document(rows: Sequence[Row], folder: Path, table: str) -> str:
     errors = errors_sheet(found)
     picked = choices(found, competitors=OTHERS)
     warnings = [*bias_lines(known, measured), *too_early([row for row in rows if not row.spp])]
-    told = "No method is biased beyond four standard errors."
-    if not known:
-        told = "Bias was not tested: that takes two seeds, and the study's images."
-    elif any(line.startswith("BIASED?") for line in warnings):
-        told = ""
+    told = _bias_told(known, measured, any(line.startswith("BIASED?") for line in warnings))
     machine = machine_lines([vars(row) for row in rows], rows[0].processor, rows[0].mitsuba)
     paragraphs = [
         "# Results",
@@ -140,6 +137,27 @@ def document(rows: Sequence[Row], folder: Path, table: str) -> str:
     return "\n\n".join(part for part in paragraphs if part) + "\n"
 
 
+def _bias_told(known: Mapping[tuple[str, str], Estimate], rows: Sequence[Row], found: bool) -> str:
+    """How many pairs of scene and method were tested for bias, by which rule, and which were not."""
+    from .report import BIAS_ERRORS, BIAS_SHARE, bias_tested
+
+    tested = bias_tested(known, rows)
+    untested = [
+        f"{method} on {scene_title(scene)}"
+        for scene, method in dict.fromkeys((row.scene, row.method) for row in rows)
+        if (scene, method) not in tested
+    ]
+    if not tested:
+        return "Bias was not tested: that takes two seeds, and the study's images."
+    pairs = "1 pair" if len(tested) == 1 else f"{len(tested)} pairs"
+    told = (
+        f"{pairs} of scene and method were tested for what seeds err in common, beyond {BIAS_ERRORS:g} standard errors "
+        f"and beyond {100 * BIAS_SHARE:g} % of the method's relMSE at the longest budget; a smaller bias would not "
+        f"be seen. {'Those that have it are named above' if found else 'None has it'}."
+    )
+    return told + (f" Not tested: {', '.join(untested)}." if untested else "")
+
+
 def _conditions(rows: Sequence[Row], times: Sequence[float], seeds: int, unit: str) -> list[str]:
     """Budget, seeds and sizes in words."""
     k = rows[0].k
@@ -172,7 +190,7 @@ def _short(total: Sequence[Overall], time: float, unit: str) -> list[str]:
     last = sorted((o for o in total if o.time == time), key=lambda o: -o.mean.value)
     return [
         f"`{o.method}`: {with_error(o.mean)} times as good as random sampling at {time:g} {unit}, in the geometric "
-        f"mean of {o.scenes} scenes; {o.wins} won, {o.ties} tied, {o.losses} lost; worst on {scene_title(o.worst[0])}, "
+        f"mean (scenes: {o.of}); {o.wins} won, {o.ties} tied, {o.losses} lost; worst on {scene_title(o.worst[0])}, "
         f"{with_error(o.worst[1])}"
         for o in last
     ]
@@ -186,7 +204,11 @@ def _matrix(found: Sequence[Cell], total: Sequence[Overall], time: float) -> str
         text = with_error(cell.gained)
         return f"**{text}** {cell.verdict}" if cell.verdict in ("win", "loss") else text
 
-    means = {o.method: with_error(o.mean) for o in total if o.time == time}
+    means = {
+        o.method: with_error(o.mean) + (f" ({o.of})" if o.left_out else "")
+        for o in total
+        if o.time == time
+    }
     return _by_scene(found, time, shown, means)
 
 

@@ -90,6 +90,8 @@ class Row:
     """The method's own, JSON."""
     configuration: str
     """Hash of all that decides the row, but for the machine."""
+    study: str
+    """Hash of what all rows of a study share: budgets, settings, sources. Others are compared with none of these."""
     commit: str
     version: str
     mitsuba: str
@@ -184,8 +186,8 @@ def write_rows(path: Path, rows: Iterable[Row]) -> None:
 
 
 def configuration(**what: Any) -> str:
-    """Hash of all that decides a run; the compiled core, and with it the estimator, is in it."""
-    text = json.dumps(what | {"core": _core_hash()}, sort_keys=True)
+    """Hash of all that decides a run; the compiled core, and with it the estimator, and what measures are in it."""
+    text = json.dumps(what | {"core": _core_hash(), "sources": _sources_hash()}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
@@ -194,6 +196,21 @@ def _core_hash() -> str:
     from .. import _core
 
     return hashlib.sha256(Path(str(_core.__file__)).read_bytes()).hexdigest()
+
+
+SHOWING = ("charts", "drawing", "findings", "page", "report", "results", "summary")
+"""Last words of modules that only show what was measured: an edit there makes no run another one."""
+
+
+@cache
+def _sources_hash() -> str:
+    """Of the measures and of the studies' own sources."""
+    here = Path(__file__).parent
+    deciding = [path for path in here.rglob("*.py") if path.stem.split("_")[-1] not in SHOWING]
+    found = hashlib.sha256()
+    for path in sorted([*deciding, here.parent / "metrics.py"]):
+        found.update(f"{path.relative_to(here.parent)}\0".encode() + path.read_bytes())
+    return found.hexdigest()
 
 
 @cache

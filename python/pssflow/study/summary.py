@@ -12,6 +12,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from ..metrics import Estimate, mean_and_error
+from ..report import scene_title
 from .store import ALL, Row
 
 __all__ = [
@@ -182,6 +183,7 @@ class Overall:
     method: str
     time: float
     scenes: int
+    """Those that have a ratio."""
     mean: Estimate
     """Geometric mean of the ratios at equal budget."""
     gain: Estimate | None
@@ -191,13 +193,30 @@ class Overall:
     ties: int
     worst: tuple[str, Estimate]
     """Scene of the smallest ratio."""
+    left_out: tuple[str, ...] = ()
+    """Scenes without a ratio, because the method's error, or random sampling's, drowns in the reference's noise."""
+
+    @property
+    def of(self) -> str:
+        """Scenes in words: all of them, or how many and which ones are missing."""
+        if not self.left_out:
+            return str(self.scenes)
+        missing = ", ".join(scene_title(scene) for scene in self.left_out)
+        return f"{self.scenes} of {self.scenes + len(self.left_out)}; below the noise on {missing}"
 
 
 def overall(found: Sequence[Cell]) -> list[Overall]:
     """All methods but the baseline, in the order of the cells."""
     groups: dict[tuple[str, float], list[tuple[Cell, Estimate]]] = {}
+    drowned: dict[tuple[str, float], list[str]] = {}
+    based = {(cell.scene, cell.time) for cell in found if cell.method == BASELINE}
     for cell in found:
-        if cell.method != BASELINE and cell.gained is not None:
+        if cell.method == BASELINE:
+            continue
+        if cell.gained is None:
+            if (cell.scene, cell.time) in based:
+                drowned.setdefault((cell.method, cell.time), []).append(cell.scene)
+        else:
             groups.setdefault((cell.method, cell.time), []).append((cell, cell.gained))
     result = []
     for (method, time), group in groups.items():
@@ -215,6 +234,7 @@ def overall(found: Sequence[Cell]) -> list[Overall]:
                 losses=verdicts.count("loss"),
                 ties=verdicts.count("tie"),
                 worst=(worst[0].scene, worst[1]),
+                left_out=tuple(drowned.get((method, time), ())),
             )
         )
     return result

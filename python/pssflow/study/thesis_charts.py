@@ -15,7 +15,7 @@ from ..report import count, number, percent, reference_panel, scene_title
 from .drawing import COLOURS, MARKERS, MUTED, finish, new_figure, plain_ticks
 from .thesis_flow import CRESCENT_EPOCHS, CRESCENT_ROWS, crescent
 from .thesis_scene import PHASES, ThesisRuns
-from .thesis_tests import Found
+from .thesis_tests import SPP, Found
 
 __all__ = ["crescent_chart", "experiment_chart", "loss_chart", "phase_chart", "render_picture"]
 
@@ -79,7 +79,9 @@ def crescent_chart(path: Path, value: Mapping[str, Any], prior: str, seed: int) 
     return finish(figure, path, title, [], caption)
 
 
-def loss_chart(path: Path, scene: str, fits: Sequence[Mapping[str, Any]]) -> list[Path]:
+def loss_chart(
+    path: Path, scene: str, parametrisation: str, fits: Sequence[Mapping[str, Any]]
+) -> list[Path]:
     """Training and held-out loss, over epochs for several numbers of paths, and over numbers of parameters."""
     from matplotlib.lines import Line2D
 
@@ -126,13 +128,14 @@ def loss_chart(path: Path, scene: str, fits: Sequence[Mapping[str, Any]]) -> lis
         "paths worse than no flow does."
     )
     title = (
-        f"Training against held-out loss of the thesis' RealNVP: {scene_title(scene)}, BSDF numbers"
+        f"Training against held-out loss of the thesis' RealNVP: {scene_title(scene)}, direction numbers "
+        f"{parametrisation}"
     )
     return finish(figure, path, title, handles, caption)
 
 
 def experiment_chart(
-    path: Path, scene: str, found: Sequence[Found], thesis: Mapping[str, float]
+    path: Path, scene: str, found: Sequence[Found], thesis: Mapping[str, float], seed: int
 ) -> list[Path]:
     """Learned ÷ random non-zero paths per camera ray, an experiment a line, a panel a parametrisation."""
     from matplotlib.lines import Line2D
@@ -177,13 +180,13 @@ def experiment_chart(
         line = {"color": COLOURS[3], "linestyle": "--", "linewidth": 1.6}
         handles.append(Line2D([], [], label="the thesis", **line))
     title = (
-        f"What would explain the thesis' ratio: {scene_title(scene)}, NEE, 16 spp drawn from the flow alone after a "
-        "pilot of 16 spp that is discarded"
+        f"What would explain the thesis' ratio: {scene_title(scene)}, NEE, {SPP} spp drawn from the flow alone after a "
+        f"pilot that is discarded, of {SPP} spp where a line says nothing else; seed {seed}"
     )
     return finish(figure, path, title, handles, "")
 
 
-def phase_chart(path: Path, every: Sequence[ThesisRuns]) -> list[Path]:
+def phase_chart(path: Path, every: Sequence[ThesisRuns], seed: int) -> list[Path]:
     """Seconds by phase of the learned run beside random sampling for as long, with the error that each came to."""
     from matplotlib.patches import Patch
 
@@ -224,7 +227,8 @@ def phase_chart(path: Path, every: Sequence[ThesisRuns]) -> list[Path]:
         )
     ]
     title = (
-        "Time by phase of the thesis' method, and random sampling for the same time (NEE, seed 0)"
+        "Time by phase of the thesis' method, and random sampling for the same time "
+        f"(NEE, seed {seed})"
     )
     return finish(figure, path, title, handles, "")
 

@@ -310,11 +310,18 @@ def _charts(findings: Findings) -> list[Chart]:
         runs = next(runs for runs in findings.scenes if runs.name == scene)
         thesis = {} if runs.thesis is None else runs.thesis.per_ray
         path = folder / f"experiments-{scene_title(scene)}.png"
-        add(experiment_chart(path, scene, found, thesis), "What would explain the thesis' ratio")
+        add(
+            experiment_chart(path, scene, found, thesis, findings.seed),
+            "What would explain the thesis' ratio",
+        )
     for scene, fits in findings.losses.items():
         path = folder / f"losses-{scene_title(scene)}.png"
-        add(loss_chart(path, scene, fits), "Training against held-out loss")
-    add(phase_chart(folder / "phases.png", findings.scenes), "Time by phase")
+        runs = next(runs for runs in findings.scenes if runs.name == scene)
+        add(
+            loss_chart(path, scene, runs.parametrisations[0], fits),
+            "Training against held-out loss",
+        )
+    add(phase_chart(folder / "phases.png", findings.scenes, findings.seed), "Time by phase")
     return charts
 
 

@@ -201,8 +201,7 @@ def render_runs(
                 render,
                 files=[image],
                 scene=scene.hash,
-                # Seconds of another run of the same configuration are as good.
-                arguments={k: v for k, v in arguments.items() if k != "time"},
+                arguments=arguments,
                 seed=seed,
                 reference_time=reference_time,
             )

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
 from functools import cache, partial
 from typing import Any
@@ -310,16 +310,30 @@ def crescents(parts: Parts, seed: int) -> dict[str, dict[str, Any]]:
 
 
 def side_by_side(work: Callable[[Any, threading.Event], Any], cases: Sequence[Any]) -> list[Any]:
-    """The results in order, as many at a time as there are cores; on Ctrl-C, or if one fails, the others end soon."""
+    """The results in order, as many at a time as there are cores; on Ctrl-C, or if one fails, the others end soon.
+
+    Raises:
+        Exception: what the case raised that failed first, not what those raise that are stopped for it.
+    """
     stop = threading.Event()
+    first: list[BaseException] = []
+
+    def failed(future: Future[Any]) -> None:
+        if not future.cancelled() and (error := future.exception()) is not None:
+            first.append(error)
+
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         futures = [pool.submit(work, case, stop) for case in cases]
+        for future in futures:
+            future.add_done_callback(failed)
         try:
             wait(futures, return_when=FIRST_EXCEPTION)
         finally:
             if not all(future.done() and not future.exception() for future in futures):
                 stop.set()
                 pool.shutdown(wait=False, cancel_futures=True)
+    if first:
+        raise first[0]
     return [future.result() for future in futures]
 
 

@@ -106,7 +106,6 @@ def stability(
                     case=[case.name, case.what, [s.name for s in case.settings]],
                     guide=guide,
                     effort={**dataclasses.asdict(effort), "threads": None},
-                    sources=_sources(),
                 )
                 row = store.find(key)
                 if row is None or strips is not None:
@@ -135,14 +134,6 @@ def _variant() -> None:
 
     if mi.variant() is None:
         mi.set_variant("scalar_rgb")
-
-
-def _sources() -> str:
-    """Hash of the cases' own sources: an edited case is another one."""
-    import hashlib
-
-    texts = (path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))
-    return hashlib.sha256(b"".join(texts)).hexdigest()[:16]
 
 
 def _examine(case: Case, guide: str, effort: Effort, benches: dict[str, Bench]) -> Finding | None:
