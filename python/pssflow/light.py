@@ -183,8 +183,12 @@ def _by_records(
 
 
 def _too_few(choice: Choice, plan: Plan) -> bool:
-    """Whether a length's samples leave none for a guide after its pilot; `auto` copes with that itself."""
-    return choice.learns and choice.kind != "auto" and plan.spp is not None and plan.spp < 2
+    """Whether a length's samples leave none for a guide after its pilot.
+
+    `auto` copes with that itself, unless its pilot is thrown away.
+    """
+    copes = choice.kind == "auto" and plan.keep_pilot
+    return choice.learns and not copes and plan.spp is not None and plan.spp < 2
 
 
 def _seed(plan: Plan, k: int) -> int:
@@ -267,6 +271,7 @@ def _sum(
         "max_weight": max(r["max_weight"] for r in stats),
         "max_contribution": max(heaviest) / brightness if brightness > 0 else 0.0,
         "ess": None,
+        "diagnostics": None,
         "passes": [],
         "combine": plan.combine,
         "candidates": None,
