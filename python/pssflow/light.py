@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import time as clock
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -201,9 +201,9 @@ def _within(listener: Listener | None, span: tuple[float, float]) -> Listener | 
         return False
 
     def report(phase: str, share: float) -> None:
-        # Pilot and training are short beside the passes after them.
-        within = share if phase == "render" else 0.0
-        listener("render", span[0] + (span[1] - span[0]) * within)
+        # Pilot and training are short beside the passes, between which some guides are trained again.
+        if phase == "render":
+            listener("render", span[0] + (span[1] - span[0]) * share)
 
     return report
 
@@ -248,9 +248,7 @@ def _sum(
     # One sample of a length has no variance.
     known = image.any() and np.isfinite(variance).all()
     relative = metrics.relative_variance(variance, image) if known else None
-    notes = [
-        note for note in dict.fromkeys(n for r in stats for n in r["notes"]) if not _of_one(note)
-    ]
+    notes = list(dict.fromkeys(note for r in stats for note in _notes(r)))
     if not image.any():
         notes.append("the image is black: no path of any length carried light")
     record: dict[str, Any] = {
@@ -302,6 +300,11 @@ def _luminance(rgb: Any) -> float:
     return float(np.asarray(rgb, np.float64) @ LUMINANCE)
 
 
-def _of_one(note: str) -> bool:
-    """Whether a note speaks of a part only: that there is no light of some length is no news."""
-    return note.startswith("the image is black")
+def _notes(length: Mapping[str, Any]) -> Iterator[str]:
+    """The notes of a length as notes of the whole: what its diagnostics say is said of that length alone."""
+    warnings = length["diagnostics"]["warnings"]
+    for note in length["notes"]:
+        if note in warnings:
+            yield f"k={length['k']}: {note}"
+        elif not note.startswith("the image is black"):  # that some length has no light is no news
+            yield note

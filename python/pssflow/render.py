@@ -181,6 +181,7 @@ def render(
             raise ValueError("`replay` repeats recorded passes; leave out `spp` and `time`")
         if isinstance(replay, (str, os.PathLike, Mapping)):
             replay = read_replay(replay)
+            _check_replayed(replay, k, max_depth)
             if "lengths" in replay:
                 guide, guide_options, replay, max_depth, records = _replayed_light(
                     replay, guide, settings
@@ -265,6 +266,25 @@ def run(scene: Scene, choice: Choice, plan: Plan, progress: Progress = True) -> 
         return Result(**images, stats=stats, timings=timings, guide=used, snapshots=snapshots)
 
     return result(output, tuple(result(part) for part in output["snapshots"]))
+
+
+def _check_replayed(record: Mapping[str, Any], k: int | None, max_depth: int | None) -> None:
+    """Refuses another length than a record has: its passes are of that one."""
+    if "lengths" not in record:
+        if max_depth is not None:
+            raise ValueError(
+                f"`max_depth` = {max_depth} was given, but `replay` holds a render of k = {record['k']}"
+            )
+        if k not in (None, record["k"]):
+            raise ValueError(
+                f"`k` = {k} was given, but `replay` holds a render of k = {record['k']}"
+            )
+        return
+    held = f"but `replay` holds all light to `max_depth` = {record['max_depth']}"
+    if k is not None:
+        raise ValueError(f"`k` = {k} was given, {held}")
+    if max_depth not in (None, record["max_depth"]):
+        raise ValueError(f"`max_depth` = {max_depth} was given, {held}")
 
 
 def _replayed(

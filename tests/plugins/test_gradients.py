@@ -103,6 +103,22 @@ def test_passes_add_up(llvm_variant, monkeypatch):
     np.testing.assert_allclose(*found, rtol=1e-4)
 
 
+def test_passes_add_up_forward(llvm_variant, monkeypatch):
+    """Also over several lengths, of which emission does not depend on the parameter."""
+    integrator: Any = mi.load_dict({"type": "pssflow", "max_depth": 3, "guide": "none"})
+    found = []
+    for most in (1 << 17, 1024):
+        monkeypatch.setattr(gradients, "MOST_AT_ONCE", most)
+        scene, params = _room()
+        image = _image(scene, params, integrator)
+        dr.set_grad(params[ALBEDO], 1.0)
+        dr.enqueue(dr.ADMode.Forward, params[ALBEDO])
+        dr.traverse(dr.ADMode.Forward)
+        found.append(np.array(dr.grad(image)))
+    assert found[0].sum() > 0
+    np.testing.assert_allclose(*found, rtol=1e-3, atol=1e-6 * found[0].max())
+
+
 @pytest.mark.parametrize(
     ("parameter", "message"),
     [
