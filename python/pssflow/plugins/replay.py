@@ -15,8 +15,9 @@ Given numbers (:monosp:`pss_replay`)
    - Added to the seed of a render. (Default: 0)
 
 Hands the rows of a matrix of numbers in [0, 1) to whatever integrator asks: lane i gets row i, its columns in the order
-in which they are asked for; ``next_2d`` takes two. Behind the last column, in lanes behind the last row, and where nothing was given, numbers are
-those of Mitsuba's generator (PCG32), one stream a lane. Numbers are given from Python, before or after ``seed``:
+in which they are asked for; ``next_2d`` takes two. Behind the last column, in lanes behind the last row, and where
+nothing was given, numbers are those of Mitsuba's generator (PCG32), one stream a lane. Numbers are given from Python,
+before or after ``seed``:
 
 .. code-block:: python
 
