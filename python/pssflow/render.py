@@ -145,7 +145,10 @@ def render(
             `stats["elapsed"]` tells the seconds really used. What handing out takes is not charged to `time`.
         max_depth: longest path in place of `k`, as Mitsuba counts: 1 for emission alone, 2 with direct light, 3 with
             light of two bounces, …, 33. Each length has its own guide and its own share of the budget: `spp` is what
-            each would get if all got the same. Fitted guides, presets and snapshots are for one k and are refused.
+            each would get if all got the same. Fitted guides, presets and snapshots are for one k and are refused. An
+            object of your own is fitted anew for each length, k = 1 first, and knows the last one afterwards.
+            `stats["lengths"]` holds a record for each; in that of the whole `k`, `ess`, `diagnostics`, `candidates` and
+            `training` are None, `passes` is empty, and `pilot` is missing.
         **guide_options: the guide's own, as `epochs=7`; in a composite also `**{"realnvp.epochs": 7}`.
 
     Returns:
