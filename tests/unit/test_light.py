@@ -109,8 +109,9 @@ def test_a_record_decides_the_depth(scene, options, message):
     with pytest.raises(ValueError, match=message):
         pssflow.render(scene, replay=record, progress=False, **options)
     one = record["lengths"][2]
+    other: dict[str, Any] = dict.fromkeys(options, 5)
     with pytest.raises(ValueError, match="was given, but `replay` holds a render of k = 2"):
-        pssflow.render(scene, replay=one, progress=False, **dict.fromkeys(options, 5))
+        pssflow.render(scene, replay=one, progress=False, **other)
     again = pssflow.render(scene, replay=record, progress=False, max_depth=3)
     assert again.stats["max_depth"] == 3
 
