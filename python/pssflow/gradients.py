@@ -13,7 +13,9 @@ geometry is refused by name: its discontinuities need other estimators.
 
 Where a lobe is a delta its weight is a constant, as in Mitsuba's `prb`; parameters of such lobes are refused too. Paths
 go on where a surface reflects nothing, since it has a derivative all the same; `prb` ends them there.
-Paths are drawn and differentiated a few samples at a time, so that memory does not grow with their number.
+Paths are drawn and differentiated a few samples at a time, so that memory does not grow with their number; one sample
+of each pixel is the least, for which the core hands out some 100 + 64·k bytes and Dr.Jit's graph takes more beside it:
+images of several megapixels are better differentiated by crops. Ctrl-C is heard between passes.
 """
 
 from __future__ import annotations
@@ -60,7 +62,12 @@ def check_parameters(scene: Any, params: Any) -> None:
     """
     if params is None:
         return
-    delta = any(_has_delta(shape.bsdf()) for shape in scene.shapes() if shape.bsdf() is not None)
+    # An instance shows a BSDF of its own, not those of its group, which cannot be seen from here.
+    delta = any(
+        shape.class_name() == "Instance" or _has_delta(shape.bsdf())
+        for shape in scene.shapes()
+        if shape.bsdf() is not None
+    )
     for name in params.keys():  # noqa: SIM118
         if not dr.grad_enabled(params[name]):
             continue
@@ -69,12 +76,13 @@ def check_parameters(scene: Any, params: Any) -> None:
             raise ValueError(
                 f"parameter `{name}` moves geometry: `pssflow` cannot differentiate it; use Mitsuba's `prb_projective`"
             )
-        if any(part in ("bumpmap", "normalmap") for part in parts):
+        # `nested_texture` is the height of a bump map; its `scale` is a plain number, which has no gradients.
+        if "nested_texture" in parts or "normalmap" in parts:
             raise ValueError(f"parameter `{name}` bends shading normals: use Mitsuba's `prb`")
         if delta and any(part in OF_DELTA_LOBES for part in parts):
             raise ValueError(
-                f"parameter `{name}` may belong to a delta lobe (mirror, glass or mask), whose derivative is not seen; "
-                "give the scene rough materials, or leave the parameter out"
+                f"parameter `{name}` may belong to a delta lobe (mirror, glass or mask, or within an instance), whose "
+                "derivative is not seen; give the scene rough materials, or leave the parameter out"
             )
 
 
@@ -137,6 +145,12 @@ def _images(
     scene = ours.mi_scene
     if ours.hide_emitters:
         raise ValueError("gradients are not supported with `hide_emitters`")
+    replaced = [note for note in ours.exported.notes if note.startswith("approximated: ")]
+    if replaced:
+        # Mitsuba would differentiate what the paths were not drawn in.
+        raise ValueError(
+            f"gradients are not supported where `approximate` replaced something: {replaced[0]}"
+        )
     if sum(surrounds for _, surrounds in ours.core.emitter_intervals()) > 1:
         raise ValueError("gradients are not supported with more than one background (sun and sky)")
     film = sensor.film()
@@ -225,6 +239,8 @@ def radiance(
             other = met & (there.emitter(scene, met) != light)
             further = scene.ray_intersect(there.spawn_ray(d), mi.RayFlags.All, False, other)
             there = dr.select(other, further, there)
+    # What still lies before the light is another one, whose light is not that of the sample.
+    met &= there.emitter(scene, met) == light
     seen = there.emitter(scene, met).eval(there, met)
     # Nothing is chosen on a point or a direction: its numbers do not matter.
     _, given = light.sample_direction(si, mi.Point2f(0.5), delta)

@@ -170,6 +170,9 @@ class Guide:
         term = None if f_bsdf is None else _luminance(np.asarray(f_bsdf, np.float32))
         if term is not None and term.shape != (len(u),):
             raise ValueError(f"`f_bsdf` has shape {term.shape}; expected that of `f`")
+        last = None if ray is None else _rows(ray)
+        if last is not None and last.shape != (len(u), 2):
+            raise ValueError(f"`ray` has shape {last.shape}; expected ({len(u)}, 2)")
         pixel = None if contexts is None else contexts.get("pixel")
         core = _core.Guide.fit(
             name,
@@ -177,7 +180,7 @@ class Guide:
             np.ascontiguousarray(luminance[lit]),
             f_max=np.ascontiguousarray(largest[lit]),
             f_bsdf=None if term is None else np.ascontiguousarray(term[lit]),
-            ray=None if ray is None else _rows(np.asarray(ray)[lit]),
+            ray=None if last is None else np.ascontiguousarray(last[lit]),
             g=np.ascontiguousarray(density[lit]),
             contexts=None if contexts is None else _vertices(contexts, lit),
             pixel=None if pixel is None else _rows(np.asarray(pixel)[lit]),

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import time as clock
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -183,8 +183,12 @@ def _by_records(
 
 
 def _too_few(choice: Choice, plan: Plan) -> bool:
-    """Whether a length's samples leave none for a guide after its pilot; `auto` copes with that itself."""
-    return choice.learns and choice.kind != "auto" and plan.spp is not None and plan.spp < 2
+    """Whether a length's samples leave none for a guide after its pilot.
+
+    `auto` copes with that itself, unless its pilot is thrown away.
+    """
+    copes = choice.kind == "auto" and plan.keep_pilot
+    return choice.learns and not copes and plan.spp is not None and plan.spp < 2
 
 
 def _seed(plan: Plan, k: int) -> int:
@@ -197,9 +201,9 @@ def _within(listener: Listener | None, span: tuple[float, float]) -> Listener | 
         return False
 
     def report(phase: str, share: float) -> None:
-        # Pilot and training are short beside the passes after them.
-        within = share if phase == "render" else 0.0
-        listener("render", span[0] + (span[1] - span[0]) * within)
+        # Pilot and training are short beside the passes, between which some guides are trained again.
+        if phase == "render":
+            listener("render", span[0] + (span[1] - span[0]) * share)
 
     return report
 
@@ -244,9 +248,7 @@ def _sum(
     # One sample of a length has no variance.
     known = image.any() and np.isfinite(variance).all()
     relative = metrics.relative_variance(variance, image) if known else None
-    notes = [
-        note for note in dict.fromkeys(n for r in stats for n in r["notes"]) if not _of_one(note)
-    ]
+    notes = list(dict.fromkeys(note for r in stats for note in _notes(r)))
     if not image.any():
         notes.append("the image is black: no path of any length carried light")
     record: dict[str, Any] = {
@@ -267,6 +269,7 @@ def _sum(
         "max_weight": max(r["max_weight"] for r in stats),
         "max_contribution": max(heaviest) / brightness if brightness > 0 else 0.0,
         "ess": None,
+        "diagnostics": None,
         "passes": [],
         "combine": plan.combine,
         "candidates": None,
@@ -297,6 +300,11 @@ def _luminance(rgb: Any) -> float:
     return float(np.asarray(rgb, np.float64) @ LUMINANCE)
 
 
-def _of_one(note: str) -> bool:
-    """Whether a note speaks of a part only: that there is no light of some length is no news."""
-    return note.startswith("the image is black")
+def _notes(length: Mapping[str, Any]) -> Iterator[str]:
+    """The notes of a length as notes of the whole: what its diagnostics say is said of that length alone."""
+    warnings = length["diagnostics"]["warnings"]
+    for note in length["notes"]:
+        if note in warnings:
+            yield f"k={length['k']}: {note}"
+        elif not note.startswith("the image is black"):  # that some length has no light is no news
+            yield note

@@ -336,15 +336,30 @@ def read_replay(replay: str | os.PathLike[str] | Mapping[str, Any]) -> dict[str,
         raise ValueError(f"{where}: holds a {type(stats).__name__}, not the record of a render")
     missing = [key for key in REPLAYED if key not in stats]
     lengths = stats.get("lengths") or []
+    if not isinstance(lengths, list) or not all(isinstance(one, Mapping) for one in lengths):
+        raise ValueError(f"{where}: `lengths` is damaged; expected a list of records")
     missing += [key for length in lengths for key in REPLAYED if key not in length]
     if missing:
         raise ValueError(f"{where}: lacks `{missing[0]}`; expected the record that `--json` prints")
     told = {key: stats[key] for key in REPLAYED}
     if lengths:
         told["max_depth"] = check_integer("max_depth", stats.get("max_depth"), 1, MAX_BOUNCES + 1)
-        told["lengths"] = [
-            {key: length[key] for key in (*REPLAYED, "probe") if key in length}
-            | {"passes": check_passes(length["passes"])}
-            for length in lengths
-        ]
+        told["lengths"] = [_length(length) for length in lengths]
     return told
+
+
+def _length(record: Mapping[str, Any]) -> dict[str, Any]:
+    """What decides the image of one length of a whole light; k = 0 is emission."""
+    probe = record.get("probe")
+    if probe is not None and not isinstance(probe, Mapping):
+        raise ValueError(f"`probe` = {probe!r}: expected a record, or null")
+    return {key: record[key] for key in REPLAYED} | {
+        "passes": check_passes(record["passes"]),
+        "k": check_integer("k", record["k"], 0, MAX_BOUNCES),
+        "seed": check_integer("seed", record["seed"], 0, 2**64 - 1),
+        "a": check_number("a", record["a"], 0.0, 1.0),
+        "emitter_strategy": check_choice(
+            "emitter_strategy", record["emitter_strategy"], EMITTER_STRATEGIES
+        ),
+        "probe": probe,
+    }

@@ -145,7 +145,10 @@ def render(
             `stats["elapsed"]` tells the seconds really used. What handing out takes is not charged to `time`.
         max_depth: longest path in place of `k`, as Mitsuba counts: 1 for emission alone, 2 with direct light, 3 with
             light of two bounces, …, 33. Each length has its own guide and its own share of the budget: `spp` is what
-            each would get if all got the same. Fitted guides, presets and snapshots are for one k and are refused.
+            each would get if all got the same. Fitted guides, presets and snapshots are for one k and are refused. An
+            object of your own is fitted anew for each length, k = 1 first, and knows the last one afterwards.
+            `stats["lengths"]` holds a record for each; in that of the whole `k`, `ess`, `diagnostics`, `candidates` and
+            `training` are None, `passes` is empty, and `pilot` is missing.
         **guide_options: the guide's own, as `epochs=7`; in a composite also `**{"realnvp.epochs": 7}`.
 
     Returns:
@@ -181,6 +184,7 @@ def render(
             raise ValueError("`replay` repeats recorded passes; leave out `spp` and `time`")
         if isinstance(replay, (str, os.PathLike, Mapping)):
             replay = read_replay(replay)
+            _check_replayed(replay, k, max_depth)
             if "lengths" in replay:
                 guide, guide_options, replay, max_depth, records = _replayed_light(
                     replay, guide, settings
@@ -265,6 +269,25 @@ def run(scene: Scene, choice: Choice, plan: Plan, progress: Progress = True) -> 
         return Result(**images, stats=stats, timings=timings, guide=used, snapshots=snapshots)
 
     return result(output, tuple(result(part) for part in output["snapshots"]))
+
+
+def _check_replayed(record: Mapping[str, Any], k: int | None, max_depth: int | None) -> None:
+    """Refuses another length than a record has: its passes are of that one."""
+    if "lengths" not in record:
+        if max_depth is not None:
+            raise ValueError(
+                f"`max_depth` = {max_depth} was given, but `replay` holds a render of k = {record['k']}"
+            )
+        if k not in (None, record["k"]):
+            raise ValueError(
+                f"`k` = {k} was given, but `replay` holds a render of k = {record['k']}"
+            )
+        return
+    held = f"but `replay` holds all light to `max_depth` = {record['max_depth']}"
+    if k is not None:
+        raise ValueError(f"`k` = {k} was given, {held}")
+    if max_depth not in (None, record["max_depth"]):
+        raise ValueError(f"`max_depth` = {max_depth} was given, {held}")
 
 
 def _replayed(

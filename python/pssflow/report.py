@@ -72,7 +72,8 @@ def runs_table(runs: Sequence[Mapping[str, Any]], thesis: ThesisScene | None = N
         else:
             cells.append(number(run["variance"]))
         cells += [number(run["max_weight"], 3), number(run["max_contribution"], 3)]
-        tail = run["diagnostics"]["pareto_k"]
+        # Those of a whole light stand with its lengths.
+        tail = (run["diagnostics"] or {}).get("pareto_k")
         cells.append("" if tail is None else f"{tail:.2f}")
         shown.add_row(*cells)
     return shown

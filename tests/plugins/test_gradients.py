@@ -103,6 +103,22 @@ def test_passes_add_up(llvm_variant, monkeypatch):
     np.testing.assert_allclose(*found, rtol=1e-4)
 
 
+def test_passes_add_up_forward(llvm_variant, monkeypatch):
+    """Also over several lengths, of which emission does not depend on the parameter."""
+    integrator: Any = mi.load_dict({"type": "pssflow", "max_depth": 3, "guide": "none"})
+    found = []
+    for most in (1 << 17, 1024):
+        monkeypatch.setattr(gradients, "MOST_AT_ONCE", most)
+        scene, params = _room()
+        image = _image(scene, params, integrator)
+        dr.set_grad(params[ALBEDO], 1.0)
+        dr.enqueue(dr.ADMode.Forward, params[ALBEDO])
+        dr.traverse(dr.ADMode.Forward)
+        found.append(np.array(dr.grad(image)))
+    assert found[0].sum() > 0
+    np.testing.assert_allclose(*found, rtol=1e-3, atol=1e-6 * found[0].max())
+
+
 @pytest.mark.parametrize(
     ("parameter", "message"),
     [
@@ -137,6 +153,95 @@ def test_what_else_is_refused(llvm_variant):
     )
     with pytest.raises((ValueError, RuntimeError), match="uniform_fraction above 0"):
         dr.backward(dr.sum(_image(scene, params, bold), axis=None))
+
+
+def _with_maps() -> Any:
+    """A room with a bump map, a normal map, and a sky whose `scale` bends nothing."""
+    values = np.random.default_rng(0).random((4, 4, 3), np.float32)
+
+    def bitmap(channels: int) -> dict[str, Any]:
+        data = mi.Bitmap(np.ascontiguousarray(values[..., :channels]))
+        return {"type": "bitmap", "raw": True, "bitmap": data}
+
+    inner = {"type": "diffuse"}
+    bump = {"type": "bumpmap", "arbitrary": bitmap(1), "bsdf": inner}
+    normal = {"type": "normalmap", "normalmap": bitmap(3), "bsdf": inner}
+    return mi.load_dict(
+        scenes.furnace_sphere()
+        | {
+            "bumpy": {
+                "type": "sphere",
+                "radius": 0.1,
+                "bsdf": {"type": "twosided", "nested": bump},
+            },
+            "bent": {"type": "sphere", "radius": 0.1, "bsdf": normal},
+            "sky": {"type": "envmap", "bitmap": mi.Bitmap(values)},
+        }
+    )
+
+
+@pytest.mark.parametrize(
+    "parameter",
+    ["bumpy.bsdf.brdf_0.nested_texture.data", "bent.bsdf.normalmap.data"],
+)
+def test_what_bends_normals_is_refused(parameter, llvm_variant):
+    scene = _with_maps()
+    params = mi.traverse(scene)
+    dr.enable_grad(params[parameter])
+    with pytest.raises(ValueError, match=f"`{parameter}` bends shading normals"):
+        gradients.check_parameters(scene, params)
+    dr.disable_grad(params[parameter])
+    for other in ("bumpy.bsdf.brdf_0.nested_bsdf.reflectance.value", "sky.scale"):
+        dr.enable_grad(params[other])
+    gradients.check_parameters(scene, params)
+
+
+def test_delta_lobes_of_instances_are_refused(llvm_variant):
+    mirror = {"type": "sphere", "radius": 0.1, "bsdf": {"type": "conductor"}}
+    view = scenes.furnace_sphere() | {
+        "group": {"type": "shapegroup", "ball": mirror},
+        "seen": {"type": "instance", "group": {"type": "ref", "id": "group"}},
+    }
+    scene = mi.load_dict(view)
+    params = mi.traverse(scene)
+    dr.enable_grad(params["group.ball.bsdf.specular_reflectance.value"])
+    with pytest.raises(ValueError, match="may belong to a delta lobe"):
+        gradients.check_parameters(scene, params)
+
+
+def test_what_was_replaced_is_refused(llvm_variant):
+    """The core traces what stands in its place, Mitsuba would differentiate the thing itself."""
+    view = scenes.furnace_sphere() | {
+        "odd": {"type": "sphere", "radius": 0.1, "bsdf": {"type": "polarizer"}}
+    }
+    bold: Any = mi.load_dict({"type": "pssflow", "guide": "none", "approximate": True})
+    for description, replaces in ((view, True), (scenes.furnace_sphere(), False)):
+        scene = mi.load_dict(description)
+        params = mi.traverse(scene)
+        dr.enable_grad(params[ALBEDO])
+        if not replaces:
+            dr.backward(dr.sum(_image(scene, params, bold), axis=None))
+            assert np.array(dr.grad(params[ALBEDO])).sum() > 0
+            continue
+        with pytest.raises((ValueError, RuntimeError), match="`approximate` replaced something"):
+            dr.backward(dr.sum(_image(scene, params, bold), axis=None))
+
+
+def test_guides_are_those_of_the_scene(llvm_variant):
+    """After another scene, or an edit, what is differentiated is rendered anew; else it is not."""
+    integrator: Any = mi.load_dict({"type": "pssflow", "guide": "direction-table"})
+    scene, params = _room()
+    ones = mi.TensorXf(np.ones((32, 32, 3), np.float32))
+    integrator.render(scene, spp=4)
+    first = integrator.result
+    integrator.render_backward(scene, params, ones, spp=4)
+    assert integrator.result is first
+    dr.disable_grad(params[ALBEDO])
+    params[ALBEDO] = mi.Color3f(0.3)
+    params.update()
+    dr.enable_grad(params[ALBEDO])
+    integrator.render_backward(scene, params, ones, spp=4)
+    assert integrator.result is not first
 
 
 def test_scalar_variants_have_none(scalar_variant):

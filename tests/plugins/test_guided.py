@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from pssflow.files import first_line
+from pssflow.plugins import guided
 from tests import scenes
 
 XML = """<scene version="3.0.0"><integrator type="pss_guided">
@@ -41,6 +42,42 @@ def test_it_says_what_it_did(llvm_variant):
     assert stats["predicted_gain"] > 0
 
 
+def test_passes_are_summed(llvm_variant, monkeypatch):
+    """What is kept to learn from is bounded, and the gain is that of all samples, however they are cut in passes."""
+    monkeypatch.setattr(guided, "MOST_AT_ONCE", 32 * 32)
+    monkeypatch.setattr(guided, "MOST_LEARNED", 3 * 32 * 32)
+    learned: list[int] = []
+    fit = guided._Candidate.fit
+
+    def listening(self: Any, u: Any, *others: Any) -> Any:
+        learned.append(len(u))
+        return fit(self, u, *others)
+
+    monkeypatch.setattr(guided._Candidate, "fit", listening)
+    integrator = _guided(guide="vegas", dimensions=5, pilot_spp=6)
+    image = _image(integrator, spp=16)
+    assert max(learned) == 3 * 32 * 32
+    assert 0.2 < integrator.stats["gain"] < 20
+    plain = _image(_guided(guide="none"), spp=64)
+    assert abs(image.mean() / plain.mean() - 1) < 0.1
+
+
+def test_sums_are_those_of_numpy():
+    """Of samples in two passes: the variance in each tile, over its squared mean and a little of the image's."""
+    rng = np.random.default_rng(0)
+    f, m = rng.random(4000, np.float32), rng.uniform(0.5, 2.0, 4000).astype(np.float32)
+    pixel = rng.random((4000, 2), np.float32)
+    sums = guided._Sums()
+    for part in (slice(0, 1500), slice(1500, None)):
+        sums.add(guided._Samples(np.empty((0, 0), np.float32), pixel[part], f[part], m[part]))
+    e, tile = f.astype(np.float64) / m, guided._tiles(pixel)
+    expected = sum(
+        e[tile == t].var() / (e[tile == t].mean() ** 2 + 0.01 * e.mean() ** 2) for t in range(64)
+    )
+    np.testing.assert_allclose(sums.mean, e.mean())
+    np.testing.assert_allclose(sums.variance(sums.mean), expected)
+
+
 def test_one_seed_gives_one_image(llvm_variant):
     a, b, c = (_image(_guided(guide="vegas"), spp=8, seed=seed) for seed in (3, 3, 4))
     np.testing.assert_array_equal(a, b)
@@ -60,7 +97,8 @@ def test_where_nothing_pays_nothing_is_guided(llvm_variant):
 def test_from_xml(llvm_variant):
     integrator = mi.load_string(XML).integrator()
     assert integrator.dimensions == 6
-    assert type(integrator.nested).__name__ == "PathIntegrator" or "path" in str(integrator).lower()
+    assert integrator.nested.class_name() == "PathIntegrator"
+    assert "max_depth = 3" in str(integrator.nested)
 
 
 @pytest.mark.parametrize(

@@ -304,6 +304,11 @@ def test_unsupported_scenes_are_refused_when_rendered(variant):
 
 def test_nothing_is_printed(scalar_variant, capfd):
     """Mitsuba warns of integrators in Python in scalar variants; that is beside the point here."""
-    image(load(), spp=1)
-    assert capfd.readouterr() == ("", "")
-    assert mi.log_level() == mi.LogLevel.Warn
+    before = mi.log_level()
+    mi.set_log_level(mi.LogLevel.Warn)  # the command sets another one
+    try:
+        image(load(), spp=1)
+        assert capfd.readouterr() == ("", "")
+        assert mi.log_level() == mi.LogLevel.Warn
+    finally:
+        mi.set_log_level(before)

@@ -130,6 +130,19 @@ def test_behind_the_columns_come_random_numbers(llvm_variant):
     assert np.array(sampler.drawn).tolist() == [3] * LANES
 
 
+def test_lanes_behind_the_last_row_draw_random_numbers(llvm_variant):
+    """Fewer rows than lanes: the others have the numbers of a sampler that was given nothing. Of a clone, too."""
+    given, plain = _sampler(), _sampler()
+    given.replay(_numbers(4)[:16])
+    plain.seed(3, LANES)
+    other = np.array(plain.next_1d())
+    for sampler in (given, given.clone()):
+        sampler.seed(3, LANES)
+        got = np.array(sampler.next_1d())
+        np.testing.assert_array_equal(got[:16], _numbers(4)[:16, 0])
+        np.testing.assert_array_equal(got[16:], other[16:])
+
+
 def test_idle_lanes_keep_their_place(llvm_variant):
     sampler = _sampler()
     u = _numbers(2)

@@ -118,6 +118,7 @@ def test_all_light_hides_them_too(artifacts: Path) -> None:
     ]
     r = welch(truth, np.stack(runs))
     assert r.p > ALPHA / 2, r.explain(artifacts)
+    assert r.has_power, r.explain(artifacts)
     assert [
         length["k"]
         for length in render(ours, "none", 1, max_depth=3, progress=False).stats["lengths"]

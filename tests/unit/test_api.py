@@ -192,6 +192,10 @@ def test_a_guide_that_looks_says_what_it_misses(furnace):
             lambda: pssflow.Guide.fit("table", pilot.u[:, :5], pilot.f),
             "give `contexts`",
         ),
+        (
+            lambda: pssflow.Guide.fit("ray-table", pilot.u[:, :5], pilot.f, ray=pilot.u[:-1, 5:]),
+            r"`ray` has shape \(\d+, 2\); expected",
+        ),
     ):
         with pytest.raises(ValueError, match=message):
             call()

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import pssflow
+from pssflow import light
 from pssflow.cli import main
 from tests import scenes
 
@@ -96,9 +97,61 @@ def test_a_recorded_run_is_repeated(scene, budget):
         pssflow.render(scene, replay=record["lengths"][2]["passes"], max_depth=4, progress=False)
 
 
-def test_progress_is_one_bar(scene):
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"k": 2}, "`k` = 2 was given, but `replay` holds all light to `max_depth` = 3"),
+        ({"max_depth": 5}, "`max_depth` = 5 was given, but `replay` holds all light to"),
+    ],
+)
+def test_a_record_decides_the_depth(scene, options, message):
+    record = _render(scene, "none", spp=1, max_depth=3).stats
+    with pytest.raises(ValueError, match=message):
+        pssflow.render(scene, replay=record, progress=False, **options)
+    one = record["lengths"][2]
+    other: dict[str, Any] = dict.fromkeys(options, 5)
+    with pytest.raises(ValueError, match="was given, but `replay` holds a render of k = 2"):
+        pssflow.render(scene, replay=one, progress=False, **other)
+    again = pssflow.render(scene, replay=record, progress=False, max_depth=3)
+    assert again.stats["max_depth"] == 3
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"lengths": 7},
+        {"lengths": [7]},
+        {"lengths": {"k": 2}},
+        *({"k": "two"}, {"a": 2.0}, {"seed": -1}, {"passes": 3}, {"probe": 1}),
+        {"emitter_strategy": "all"},
+    ],
+)
+def test_damaged_records_are_refused(scene, damage):
+    record = json.loads(json.dumps(_render(scene, "none", spp=1, max_depth=2).stats))
+    (record if "lengths" in damage else record["lengths"][1]).update(damage)
+    with pytest.raises(ValueError, match=next(iter(damage))) as caught:
+        pssflow.render(scene, replay=record, progress=False)
+    assert "\n" not in str(caught.value)
+
+
+def test_auto_without_its_pilot_renders_lengths_of_one_sample(scene):
+    result = _render(scene, "auto", spp=1, keep_pilot=False)
+    assert min(length["spp"] for length in result.stats["lengths"]) == 1
+    assert result.image.mean() > 0
+
+
+def test_what_diagnostics_say_is_said_of_a_length():
+    diagnostics = {"warnings": ["the tail is heavy"]}
+    notes = ["sky: baked", "the tail is heavy", "the image is black: no light"]
+    length = {"k": 2, "diagnostics": diagnostics, "notes": notes}
+    assert list(light._notes(length)) == ["sky: baked", "k=2: the tail is heavy"]
+
+
+@pytest.mark.parametrize(("guide", "spp"), [("none", 2), ("table", 40)])
+def test_progress_is_one_bar(scene, guide, spp):
+    """Also where passes and training take turns."""
     told: list[tuple[str, float]] = []
-    pssflow.render(scene, "none", 2, max_depth=3, progress=lambda *a: told.append(a))
+    pssflow.render(scene, guide, spp, max_depth=3, progress=lambda *a: told.append(a))
     assert {phase for phase, _ in told} <= {"render"}
     shares = [share for _, share in told]
     assert shares == sorted(shares)

@@ -57,7 +57,7 @@ the integrator says what was chosen and what it gained: the variance of uniform 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -94,6 +94,8 @@ PILOT_WEIGHT = 0.5
 """As in the estimator of `pssflow`: fixed before sampling, and above an eighth of the samples a cap on all gains."""
 MOST_AT_ONCE = 1 << 19
 """Samples of a pass: bounds memory."""
+MOST_LEARNED = 1 << 21
+"""Samples of the pilot that are kept to learn from, to the end of a pass; those after them are in the image alone."""
 TILES = 8
 """Along each side of the image, for the prediction; as `vegas` has them."""
 
@@ -115,6 +117,31 @@ class _Samples:
     """Luminance, undivided."""
     m: F32
     """Density of the numbers."""
+
+
+class _Sums:
+    """What is left of samples that nothing is learned from: by tile their number, Σ e and Σ e² of e = f ÷ m."""
+
+    def __init__(self) -> None:
+        self.n, self.first, self.second = np.zeros((3, TILES**2))
+
+    def add(self, samples: _Samples) -> None:
+        """Adds a pass."""
+        tile, estimate = _tiles(samples.pixel), samples.f.astype(np.float64) / samples.m
+        self.n += np.bincount(tile, minlength=TILES**2)
+        self.first += np.bincount(tile, estimate, TILES**2)
+        self.second += np.bincount(tile, estimate**2, TILES**2)
+
+    @property
+    def mean(self) -> float:
+        """Of all samples."""
+        return float(self.first.sum() / max(self.n.sum(), 1.0))
+
+    def variance(self, whole: float) -> float:
+        """Variance of a sample, relative to its tile's mean, summed over tiles; `whole`: mean of the image."""
+        counts = np.maximum(self.n, 1.0)
+        mean, second = self.first / counts, self.second / counts
+        return float(np.sum((second - mean**2) / np.maximum(mean**2 + (0.1 * whole) ** 2, 1e-30)))
 
 
 @dataclass(frozen=True)
@@ -222,18 +249,27 @@ def define() -> Callable[[Any], Any]:
             pilot_spp = self.pilot_spp or max(spp // PILOT_DIVISOR, 2)
             learns = self.guide != "none" and pilot_spp < spp
             clock = [time.perf_counter()]
-            pilot: list[_Samples] = []
+            kept: list[_Samples] = []
+            pilot = _Sums()
             if learns:
-                pilot = self._passes(scene, camera, block, pilot_spp, rng, None, 1.0, PILOT_WEIGHT)
+                for samples in self._passes(
+                    scene, camera, block, pilot_spp, rng, None, 1.0, PILOT_WEIGHT
+                ):
+                    pilot.add(samples)
+                    if sum(len(s.f) for s in kept) < MOST_LEARNED:
+                        kept.append(samples)
             clock.append(time.perf_counter())
-            guide, a, promised = self._learn(pilot, rng) if learns else (None, 1.0, None)
+            guide, a, promised = self._learn(kept, rng) if learns else (None, 1.0, None)
+            kept.clear()
             clock.append(time.perf_counter())
             rest = spp - pilot_spp if learns else spp
-            drawn = self._passes(scene, camera, block, rest, rng, guide, a, 1.0)
+            drawn = _Sums()
+            for samples in self._passes(scene, camera, block, rest, rng, guide, a, 1.0):
+                drawn.add(samples)
             clock.append(time.perf_counter())
             gain: float | None = None
             if guide is not None and rest > 1:
-                gain = _variance(pilot, pilot) / max(_variance(drawn, pilot), 1e-30)
+                gain = pilot.variance(pilot.mean) / max(drawn.variance(pilot.mean), 1e-30)
             pilot_s, fit_s, render_s = (float(s) for s in np.diff(clock))
             self.stats = {
                 "chosen": "none" if guide is None else guide.name,
@@ -260,15 +296,13 @@ def define() -> Callable[[Any], Any]:
             guide: Guide | None,
             a: float,
             weight: float,
-        ) -> list[_Samples]:
+        ) -> Iterator[_Samples]:
             """Renders `spp` samples a pixel, a few at a time, and puts them on the film with a weight."""
             width, height = (int(n) for n in camera.film().crop_size())
             most = max(MOST_AT_ONCE // (width * height), 1)
-            done = []
             for start in range(0, spp, most):
                 n = min(most, spp - start)
-                done.append(self._pass(scene, camera, block, n, rng, guide, a, weight))
-            return done
+                yield self._pass(scene, camera, block, n, rng, guide, a, weight)
 
         def _pass(
             self,
@@ -445,19 +479,3 @@ def _second_moment(f: F32, m: NDArray[np.float64], pixel: F32) -> float:
     second = np.bincount(tile, f.astype(np.float64) ** 2 / m, TILES**2) / counts
     epsilon = (0.1 * f.mean(dtype=np.float64)) ** 2
     return float(np.sum((second - mean**2) / np.maximum(mean**2 + epsilon, 1e-30)))
-
-
-def _variance(samples: Sequence[_Samples], beside: Sequence[_Samples]) -> float:
-    """Variance of a sample f ÷ m, relative to the tile's mean in `beside`, averaged over tiles."""
-    tile, estimate = (
-        np.concatenate(list(values))
-        for values in (
-            (_tiles(s.pixel) for s in samples),
-            (s.f.astype(np.float64) / s.m for s in samples),
-        )
-    )
-    counts = np.maximum(np.bincount(tile, minlength=TILES**2), 1)
-    mean = np.bincount(tile, estimate, TILES**2) / counts
-    second = np.bincount(tile, estimate**2, TILES**2) / counts
-    whole = np.mean(np.concatenate([s.f for s in beside]), dtype=np.float64)
-    return float(np.sum((second - mean**2) / np.maximum(mean**2 + (0.1 * whole) ** 2, 1e-30)))

@@ -167,6 +167,7 @@ def define() -> Callable[[Any], Any]:
             self.progress = bool(props.get("progress", False))
             self.approximate = bool(props.get("approximate", False))
             self.result: Result | None = None
+            self.rendered = ""
             # Wrong values are found where the scene is loaded, not when it is rendered.
             plan = self._plan(spp=0, seed=0, sample_count=DEFAULT_SPP)
             if self.max_depth is not None:
@@ -196,6 +197,7 @@ def define() -> Callable[[Any], Any]:
                 self.result = run(ours, self.choice, plan, self.progress)
             else:
                 self.result = render_light(ours, self.choice, plan, self.max_depth, self.progress)
+            self.rendered = ours.hash
             _fill(camera.film(), self.result, self.aov_names())
             return camera.film().develop() if develop else mi.TensorXf()
 
@@ -234,7 +236,8 @@ def define() -> Callable[[Any], Any]:
             ours = Scene(
                 scene, camera, hide_emitters=self.hide_emitters, approximate=self.approximate
             )
-            if self.result is None:
+            # The guides of another scene, or of this one before an edit, may know nothing of this one.
+            if self.result is None or self.rendered != ours.hash:
                 self.render(scene, camera, spp=spp)
             assert self.result is not None
             samples = int(spp) or self.arguments.get("spp") or camera.sampler().sample_count()

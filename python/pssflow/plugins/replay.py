@@ -15,8 +15,9 @@ Given numbers (:monosp:`pss_replay`)
    - Added to the seed of a render. (Default: 0)
 
 Hands the rows of a matrix of numbers in [0, 1) to whatever integrator asks: lane i gets row i, its columns in the order
-in which they are asked for; ``next_2d`` takes two. Behind the last column, and where nothing was given, numbers are
-those of Mitsuba's generator (PCG32), one stream a lane. Numbers are given from Python, before or after ``seed``:
+in which they are asked for; ``next_2d`` takes two. Behind the last column, in lanes behind the last row, and where
+nothing was given, numbers are those of Mitsuba's generator (PCG32), one stream a lane. Numbers are given from Python,
+before or after ``seed``:
 
 .. code-block:: python
 
@@ -65,6 +66,7 @@ def define() -> Callable[[Any], Any]:
             self.rng = self._generator()
             self.numbers = mi.Float(0.0)
             self.columns = mi.UInt32(0)
+            self.rows = mi.UInt32(0)
 
         def replay(self, u: Any) -> None:
             """Gives the numbers (lanes, columns); None takes them back.
@@ -73,7 +75,8 @@ def define() -> Callable[[Any], Any]:
                 ValueError: they are no matrix, or lie outside [0, 1).
             """
             if u is None:
-                self.numbers, self.columns = mi.Float(0.0), mi.UInt32(0)
+                self.numbers = mi.Float(0.0)
+                self.columns, self.rows = mi.UInt32(0), mi.UInt32(0)
                 return
             rows = np.ascontiguousarray(u, np.float32)
             if rows.ndim != 2 or 0 in rows.shape:
@@ -86,6 +89,7 @@ def define() -> Callable[[Any], Any]:
             # Opaque, so that other numbers and other columns need no other kernel.
             self.numbers = to_jit(mi.Float, rows)
             self.columns = dr.opaque(mi.UInt32, rows.shape[1])
+            self.rows = dr.opaque(mi.UInt32, rows.shape[0])
 
         def seed(self, seed: Any, wavefront_size: int = 0xFFFFFFFF) -> None:
             """Starts over, with a lane for each of `wavefront_size`."""
@@ -104,7 +108,7 @@ def define() -> Callable[[Any], Any]:
         def next_1d(self, active: Any = True) -> Any:
             """The next column of each active lane."""
             active = mi.Bool(active)
-            given = active & (self.drawn < self.columns)
+            given = active & (self.drawn < self.columns) & (self.lane < self.rows)
             index = dr.fma(self.lane, self.columns, self.drawn)
             replayed = dr.gather(mi.Float, self.numbers, dr.select(given, index, 0), given)
             # Drawn in any case: what comes behind the columns must not depend on how many there are.
@@ -134,7 +138,8 @@ def define() -> Callable[[Any], Any]:
             other = self.fork()
             other.drawn, other.lane = mi.UInt32(self.drawn), mi.UInt32(self.lane)
             other.rng = self._generator(self.rng)
-            other.numbers, other.columns = mi.Float(self.numbers), mi.UInt32(self.columns)
+            other.numbers = mi.Float(self.numbers)
+            other.columns, other.rows = mi.UInt32(self.columns), mi.UInt32(self.rows)
             return other
 
         def schedule_state(self) -> None:
