@@ -77,10 +77,12 @@ OUTSIDE = Case(
 
 
 def _poisoned(f: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Contributions with an outlier of 1e6 times the mean, NaN, infinities of both signs and denormals among them."""
+    """Contributions (n, 3) with an outlier of 1e6 times the mean, NaN, infinities of both signs and denormals among those
+    that carry light; black ones are left out when a guide is fitted, whatever is in them.
+    """
     f = f.copy()
-    rows = rng.permutation(len(f))
-    f[rows[0]] = 1e6 * f.mean()
+    rows = rng.permutation(np.flatnonzero(f.max(axis=1) > 0))
+    f[rows[:1]] = 1e6 * f.mean()
     for i, value in enumerate((np.nan, np.inf, -np.inf, 1e-42, -1.0)):
         f[rows[1 + 3 * i : 4 + 3 * i]] = value
     return f
@@ -104,8 +106,10 @@ def _poison(guide: str, effort: Effort, folder: Path) -> Finding | None:
             emitter_strategy=strategy,
             threads=effort.threads,
         )
-        f = _poisoned(pilot.f, np.random.default_rng(seed))
-        fitted = replace(pilot, f=f).fit(name, seed=seed, **options)
+        rng = np.random.default_rng(seed)
+        # Some guides learn from whole paths, others from what their BSDF-sampled rays found; other rows of either.
+        poisoned = replace(pilot, f=_poisoned(pilot.f, rng), f_bsdf=_poisoned(pilot.f_bsdf, rng))
+        fitted = poisoned.fit(name, seed=seed, **options)
         results.append(
             bench.scene.render(
                 fitted,
@@ -124,7 +128,8 @@ POISON = Case(
     4,
     "poisoned-training",
     "Outliers, NaN and infinities in training",
-    "One path of 1e6 times the mean, three each of NaN, ±∞, denormal and negative radiance among the records: a "
+    "One path of 1e6 times the mean, three each of NaN, ±∞, denormal and negative radiance among the records, and as "
+    "many of what BSDF-sampled rays found: a "
     "loss that is not finite once is so for ever, and one outlier pulls all mass to itself.",
     probe=_poison,
 )
