@@ -16,6 +16,8 @@ import pssflow
 from pssflow.study.stability.parts import room
 from tests.conftest import ROOT, SCALAR
 
+pytestmark = pytest.mark.timeout(300)
+
 GUIDES: dict[str, dict[str, Any]] = {
     "table": {},
     "vegas": {},

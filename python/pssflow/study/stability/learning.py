@@ -77,8 +77,8 @@ OUTSIDE = Case(
 
 
 def _poisoned(f: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Contributions (n, 3) with an outlier of 1e6 times the mean, NaN, infinities of both signs and denormals among those
-    that carry light; black ones are left out when a guide is fitted, whatever is in them.
+    """Contributions (n, 3) with an outlier of 1e6 times the mean, NaN, infinities of both signs and denormals among
+    those that carry light; black ones are left out when a guide is fitted, whatever is in them.
     """
     f = f.copy()
     rows = rng.permutation(np.flatnonzero(f.max(axis=1) > 0))

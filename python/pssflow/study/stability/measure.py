@@ -244,10 +244,8 @@ def _bias(bench: Bench, images: F32, results: Sequence[Result]) -> tuple[bool, f
     return not compared.has_power, float(min(p_image, holm(p_tiles).min()))
 
 
-def _bias_beyond_bound(
-    bench: Bench, images: F32, results: Sequence[Result], a: float
-) -> float:
-    """p of the image's mean if its paths had the largest variance that a allows; 1 without a bound."""
+def _bias_beyond_bound(bench: Bench, images: F32, results: Sequence[Result], a: float) -> float:
+    """The p of the image's mean if its paths had the largest variance that a allows; 1 without a bound."""
     if a <= 0:
         return 1.0
     paths = sum(int(r.stats["camera_rays"]) for r in results)
