@@ -155,25 +155,28 @@ def judge(bench: Bench, results: Sequence[Result]) -> Finding:
         return finding("fails", what)
     heavy, p = _bias(bench, images, results)
     numbers["p"] = p
+    unsure = ""
     # Of a mode that a few paths in all runs meet, their spread says nothing of the variance.
     if p < ALPHA / 2 and not bench.setting.blind:
         there, here = float(truth.mean()), float(images.mean())
-        what = f"{figure}; mean {here / there:.3g} of the truth, p = {p:.1g}"
+        figure += f"; mean {here / there:.3g} of the truth, p = {p:.1g}"
         # Where one sample holds much of the sum, neither side knows its variance, and p says little: but no variance is
         # above E[f²]/a.
         if not heavy or _bias_beyond_bound(bench, images, results, a) < ALPHA / 2:
-            return finding("fails", what)
-        return finding("degrades", what, "too heavy-tailed to tell bias from noise")
+            return finding("fails", figure)
+        unsure = "too heavy-tailed to tell bias from noise"
     bound = numbers["bound"]
     if a > 0 and bound is not None and bound - ERRORS * error > 1.0:
         return finding("fails", f"E[(f/m)²] = {bound:.3g} · E[f²]/a")
     ratio = numbers["ratio"] or 0.0
     if a == 0 and max(ratio, numbers["mean_ratio"] or 0.0) > HOPELESS:
         return finding("fails", f"{figure}, mean of the seeds {numbers['mean_ratio']:.2g} ×")
-    if ratio <= HARMLESS:
+    if ratio <= HARMLESS and not unsure:
         return finding("holds", figure)
     silent = bench.setting.blind and (numbers["warned"] or 0.0) < 0.5
-    return finding("degrades", figure, "most renders say nothing of it" if silent else "")
+    return finding(
+        "degrades", figure, unsure or ("most renders say nothing of it" if silent else "")
+    )
 
 
 def _errors(bench: Bench, images: F32) -> dict[str, float | None]:
