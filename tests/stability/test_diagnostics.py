@@ -16,6 +16,8 @@ import pssflow
 from pssflow.study.stability.parts import room
 from tests.conftest import ROOT, SCALAR
 
+pytestmark = pytest.mark.timeout(300)
+
 GUIDES: dict[str, dict[str, Any]] = {
     "table": {},
     "vegas": {},
@@ -106,15 +108,17 @@ np.save(sys.argv[1], image)
 """
 
 
-def test_avx2_and_avx512_agree(tmp_path: Path) -> None:
+@pytest.mark.timeout(1200)
+def test_instruction_sets_agree(tmp_path: Path) -> None:
     """Embree rounds differently; our own kernels do not use AVX-512. A path that grazes an edge may go another way, and
     then so do the tables that learn from it: the median pixel differs by less than 1 %, and so does the mean.
+
+    The widest set that there is beside the narrowest one, which is all that this needs of a processor.
     """
     flags = Path("/proc/cpuinfo").read_text(encoding="ascii") if sys.platform == "linux" else ""
-    if "avx512vl" not in flags:
-        pytest.skip("this processor has no AVX-512")
+    widest = "avx512" if "avx512vl" in flags else "avx2"
     images = []
-    for isa in ("avx2", "avx512"):
+    for isa in ("sse4.2", widest):
         path = tmp_path / f"{isa}.npy"
         environment = {**os.environ, "PSSFLOW_ISA": isa}
         subprocess.run(
@@ -122,7 +126,7 @@ def test_avx2_and_avx512_agree(tmp_path: Path) -> None:
             check=True,
             env=environment,
             cwd=ROOT,
-            timeout=120,
+            timeout=600,
         )
         images.append(np.load(path).astype(np.float64))
     a, b = images

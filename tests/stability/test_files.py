@@ -48,18 +48,20 @@ def _check_cuts(name: str, folder: Path, step: int) -> int:
     return len(cuts)
 
 
+@pytest.mark.timeout(300)
 @pytest.mark.parametrize("name", GUIDES)
 def test_a_guide_cut_short_is_refused(name: str, tmp_path: Path) -> None:
     _check_cuts(name, tmp_path, 1 if name == "vegas" else 101)
 
 
 @pytest.mark.long
-@pytest.mark.timeout(1800)
+@pytest.mark.timeout(7200)
 @pytest.mark.parametrize("name", GUIDES)
 def test_a_guide_cut_at_every_byte_is_refused(name: str, tmp_path: Path) -> None:
     _check_cuts(name, tmp_path, 1)
 
 
+@pytest.mark.timeout(900)
 def test_a_full_disk_leaves_nothing(tmp_path: Path) -> None:
     """A limit on the size of files stands for the disk: guide, image and pilot are refused and removed."""
     mi.set_variant(SCALAR)
@@ -90,6 +92,7 @@ def _write_full(job: Any) -> str:
     return "written"
 
 
+@pytest.mark.timeout(300)
 def test_an_interrupt_ends_a_render(tmp_path: Path) -> None:
     """What a progress function raises is what Ctrl-C raises; the render is over in a moment and can be repeated."""
     mi.set_variant(SCALAR)
@@ -103,6 +106,7 @@ def test_an_interrupt_ends_a_render(tmp_path: Path) -> None:
     assert np.isfinite(scene.render("table", 2, progress=False).image).all()
 
 
+@pytest.mark.timeout(900)
 def test_the_study_resumes(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """What was found out once is not found out again; an interrupted study goes on behind it."""
     folder = tmp_path / "out"

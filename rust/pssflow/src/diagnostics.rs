@@ -190,11 +190,14 @@ impl Diagnostics {
 
     fn worries(&self, paths: u64) -> Vec<String> {
         let mut worries = Vec::new();
-        if let Some(k) = self.pareto_k.filter(|k| *k > HEAVY_TAIL) {
-            worries.push(format!(
-                "the contributions' tail is heavy (Pareto k = {k:.2} > {HEAVY_TAIL}): the variance estimate is not to be \
-                 trusted"
-            ));
+        if let Some(k) = self.pareto_k {
+            let error = tail_error(k, self.tail_paths);
+            if k - error > HEAVY_TAIL {
+                worries.push(format!(
+                    "the contributions' tail is heavy (Pareto k = {k:.2} ± {error:.2} > {HEAVY_TAIL}): the variance estimate \
+                     is not to be trusted"
+                ));
+            }
         }
         if let Some(moment) = self.second_moment.filter(SecondMoment::disagrees) {
             worries.push(format!(
@@ -219,6 +222,11 @@ impl Diagnostics {
         }
         worries
     }
+}
+
+/// Standard error of a shape k̂ ≥ −½ that was fitted to so many values (asymptotic, as that of the maximum likelihood).
+fn tail_error(shape: f64, values: usize) -> f64 {
+    (1.0 + shape) / (values as f64).sqrt()
 }
 
 /// The means of pilot and guided paths. Their errors contain what differs between pixels, so that z is rather too small.
@@ -352,5 +360,38 @@ mod tests {
         assert_eq!(found.warnings.len(), 1, "{:?}", found.warnings);
         let same = side(10_000, 990, 10_000);
         assert_eq!(Diagnostics::of(&evidence(&same)).warnings, [""; 0]);
+    }
+    #[test]
+    fn a_tail_is_told_where_it_is_heavy_beyond_its_error() {
+        let film = film(vec![1.0; 3]);
+        // Quantiles of a Pareto distribution of shape k, from u = 1 down.
+        let warned = |k: f64, n: u64| {
+            let mut side = Statistics::default();
+            side.counts.camera_rays = n;
+            side.counts.nonzero = n;
+            for i in 1..=n {
+                side.tail.add((i as f64 / n as f64).powf(-k) as f32);
+            }
+            let found = Diagnostics::of(&Evidence {
+                in_image: &side,
+                pilot: &Statistics::default(),
+                rendered: &Statistics::default(),
+                pools: &Pools::default(),
+                mass_outside: None,
+                film: &film,
+            });
+            let shape = found.pareto_k.unwrap_or_default();
+            (shape, found.warnings.len())
+        };
+        // The same tail, 1: within its error of 200 paths, beyond that of a hundred thousand.
+        let (few, many) = (warned(1.0, 200), warned(1.0, 100_000));
+        assert!(
+            few.0 > HEAVY_TAIL && many.0 > HEAVY_TAIL,
+            "{few:?} {many:?}"
+        );
+        assert_eq!([few.1, many.1], [0, 1]);
+        // Far above, few paths suffice; below, none do.
+        assert_eq!(warned(2.0, 200).1, 1);
+        assert_eq!(warned(0.6, 100_000).1, 0);
     }
 }

@@ -224,7 +224,6 @@ impl Run<'_> {
         } else {
             0.0
         };
-        let mut older = self.records.len();
         if record > 0.0 {
             // Those of the tiles under way need room, too, until they are merged.
             record *= self.reserve_records();
@@ -247,13 +246,11 @@ impl Run<'_> {
         } else {
             &mut self.image
         };
-        let statistics = self.context.render(&pass, image, &mut self.records)?;
+        let (statistics, older) = self.context.render(&pass, image, &mut self.records)?;
         self.short_of_memory |= statistics.short_of_memory;
         self.apart.extend(own.filter(|_| !discarded));
         if record > 0.0 {
             self.records.count(statistics.counts.camera_rays);
-            // Where memory ran out, older ones gave way.
-            older = older.min(self.records.len());
             let newer = self.records.len() - older;
             let rest = self.max_records.saturating_sub(newer);
             self.records.thin(older, [rest, newer]);

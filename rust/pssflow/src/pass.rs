@@ -100,13 +100,14 @@ struct Piece {
 }
 
 impl PassContext<'_> {
-    /// Renders `pass`, adds it to `image`, and its paths that are kept to `records`.
+    /// Renders `pass`, adds it to `image`, and its paths that are kept to `records`. Also returns how many of these are
+    /// older than the pass: fewer than before, where memory ran short and some gave way.
     pub(crate) fn render(
         &self,
         pass: &Pass<'_>,
         image: &mut Accumulator,
         records: &mut PathRecords,
-    ) -> Result<Statistics, RenderError> {
+    ) -> Result<(Statistics, usize), RenderError> {
         let pieces = self.pieces(pass);
         let mut total = Statistics::default();
         let (mut pass, mut older) = (*pass, records.len());
@@ -139,7 +140,7 @@ impl PassContext<'_> {
             self.progress
                 .update(pass.phase, start + (end - start) * share);
         }
-        Ok(total)
+        Ok((total, older))
     }
 
     /// The pass cut into (tile, first sample, samples), in the order in which they are merged.

@@ -14,10 +14,10 @@ from ...files import first_line
 from ...guide import Guide
 from ...render import Result
 from ...scene import Scene
-from .case import CHEAP, THESIS, Case, Effort, Finding, Setting, render_options
+from .case import CHEAP, THESIS, Case, Effort, Finding, Setting, render_options, worst
 from .materials import glow
 from .measure import Bench, judge
-from .parts import diffuse, lamp, room, twosided
+from .parts import camera, diffuse, lamp, room, twosided
 
 __all__ = ["AGGRESSIVE", "FEW", "MOVING", "OUTSIDE", "OVERFIT", "POISON", "PRIOR"]
 
@@ -77,10 +77,12 @@ OUTSIDE = Case(
 
 
 def _poisoned(f: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Contributions with an outlier of 1e6 times the mean, NaN, infinities of both signs and denormals among them."""
+    """Contributions (n, 3) with an outlier of 1e6 times the mean, NaN, infinities of both signs and denormals among
+    those that carry light; black ones are left out when a guide is fitted, whatever is in them.
+    """
     f = f.copy()
-    rows = rng.permutation(len(f))
-    f[rows[0]] = 1e6 * f.mean()
+    rows = rng.permutation(np.flatnonzero(f.max(axis=1) > 0))
+    f[rows[:1]] = 1e6 * f.mean()
     for i, value in enumerate((np.nan, np.inf, -np.inf, 1e-42, -1.0)):
         f[rows[1 + 3 * i : 4 + 3 * i]] = value
     return f
@@ -104,8 +106,10 @@ def _poison(guide: str, effort: Effort, folder: Path) -> Finding | None:
             emitter_strategy=strategy,
             threads=effort.threads,
         )
-        f = _poisoned(pilot.f, np.random.default_rng(seed))
-        fitted = replace(pilot, f=f).fit(name, seed=seed, **options)
+        rng = np.random.default_rng(seed)
+        # Some guides learn from whole paths, others from what their BSDF-sampled rays found; other rows of either.
+        poisoned = replace(pilot, f=_poisoned(pilot.f, rng), f_bsdf=_poisoned(pilot.f_bsdf, rng))
+        fitted = poisoned.fit(name, seed=seed, **options)
         results.append(
             bench.scene.render(
                 fitted,
@@ -124,7 +128,8 @@ POISON = Case(
     4,
     "poisoned-training",
     "Outliers, NaN and infinities in training",
-    "One path of 1e6 times the mean, three each of NaN, ±∞, denormal and negative radiance among the records: a "
+    "One path of 1e6 times the mean, three each of NaN, ±∞, denormal and negative radiance among the records, and as "
+    "many of what BSDF-sampled rays found: a "
     "loss that is not finite once is so for ever, and one outlier pulls all mass to itself.",
     probe=_poison,
 )
@@ -250,20 +255,40 @@ def _spot(x: float) -> Callable[[int], dict[str, Any]]:
 LEFT, RIGHT = _spot(-0.7), _spot(0.7)
 
 
+def _aside(side: int) -> dict[str, Any]:
+    """The lamp on the left, seen from the right wall."""
+    return LEFT(side) | {"camera": camera(side, (0.9, 0.3, 0.2), (-1.0, 0.4, -0.4))}
+
+
+LESSON = 16
+"""Times the samples of the render that a guide learns from there: it must be sure of what is wrong here."""
+
+
 def _moving(guide: str, effort: Effort, folder: Path) -> Finding | None:
-    """Learns with the lamp on the left and renders with the lamp on the right: the saved guide is refused, and
-    the object itself loses no more than 1/a.
+    """Learns with the lamp on the left, seen as here or from elsewhere, and renders with the lamp on the right: the
+    saved guide is refused, and the object itself loses no more than 1/a.
     """
     if guide == "none":
         return None
     here = Bench.of(Setting("lamp on the right", RIGHT, blind=True), effort)
-    there = Scene(LEFT(effort.side))
+    return worst([_moved(guide, effort, folder, here, there) for there in (LEFT, _aside)])
+
+
+def _moved(
+    guide: str,
+    effort: Effort,
+    folder: Path,
+    here: Bench,
+    elsewhere: Callable[[int], dict[str, Any]],
+) -> Finding:
+    there = Scene(elsewhere(effort.side))
     results: list[Result] = []
     for seed in range(effort.seeds):
         how = render_options(guide, effort) | {"threads": effort.threads, "progress": False}
-        learned = there.render(**how, spp=effort.spp, seed=seed).guide
+        learned = there.render(**how, spp=LESSON * effort.spp, seed=seed).guide
         if learned is None:
-            return Finding("holds", "none was chosen: there is nothing to move")
+            # Of other seeds' guides there may be one to use.
+            continue
         path = folder / f"moved-{guide.replace('+', '_')}-{seed}.guide"
         if isinstance(learned, Guide):
             learned.save(path)
@@ -287,6 +312,8 @@ def _moving(guide: str, effort: Effort, folder: Path) -> Finding | None:
                 **options,
             )
         )
+    if not results:
+        return Finding("holds", "none was chosen: there is nothing to move")
     found = judge(here, results)
     said = "the file is refused; the object was used"
     return replace(found, why="; ".join(t for t in (said, found.why) if t))
@@ -296,6 +323,7 @@ MOVING = Case(
     15,
     "moving-target",
     "Learned elsewhere",
-    "A guide of one lamp is used for another: its density is small exactly where the light is now.",
+    "A guide of one lamp, or of another camera, too, is used for another lamp: its density is small exactly where the "
+    "light is now.",
     probe=_moving,
 )

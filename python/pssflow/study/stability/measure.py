@@ -1,6 +1,7 @@
 """Renders a case's settings with a guide and with random numbers, and judges the one by the other.
 
-A guide *holds* where its images are finite and unbiased (Welch's test of the mean and of tiles against the truth), no
+A guide *holds* where its images are finite and unbiased (the mean and tiles against the truth: by Welch's test, or with
+the variance that the renders state where seeds are few), no
 path weighs more than 1/a, E[(f/m)²] ≤ E[f²]/a within its error, and its relMSE is at most 1.3 times that of as many
 random samples (median over seeds). It *degrades* where it is only slower, and *fails* where one of the others
 breaks, or at a = 0 is more than ten times slower. (With a > 0 the second moment has a bound. The variance, which is
@@ -21,7 +22,7 @@ from ... import metrics
 from ...files import first_line
 from ...render import Result
 from ...scene import Scene
-from ..welch import ALPHA, welch
+from ..welch import ALPHA, LUMINANCE, Moments, holm, p_value, tile_means, welch
 from .case import THESIS, Case, Effort, Finding, Setting, render_options, worst
 
 __all__ = ["HARMLESS", "Bench", "judge", "measure"]
@@ -37,6 +38,9 @@ HOPELESS = 10.0
 ERRORS = 4.0
 """Standard errors that the measured bound may be exceeded by."""
 
+FEW_SEEDS = 8
+"""Fewer images than these say so little of their variance that no bias would be seen; the renders' own is taken."""
+
 FIRST_SEED = 1000
 """Of the renders; the truth counts from 0."""
 
@@ -51,6 +55,8 @@ class Bench:
     truth: F32
     """Runs, (n, h, w, 3)."""
     random: list[Result]
+    square: float
+    """E[f²] of the truth's paths (of the random renders', where the truth is no render)."""
 
     @classmethod
     def of(cls, setting: Setting, effort: Effort) -> Bench:
@@ -58,19 +64,21 @@ class Bench:
         effort = replace(effort, spp=setting.spp or effort.spp, side=setting.side or effort.side)
         scene = Scene(setting.scene(effort.side))
         many = {**setting.options, "threads": effort.threads, "progress": False}
-        if setting.truth is not None:
-            truth = setting.truth(effort.side, effort.truth, 16 * effort.spp, effort.threads)
-        else:
-            runs = [
-                scene.render("none", 16 * effort.spp, seed=seed, **many).image
-                for seed in range(effort.truth)
-            ]
-            truth = np.stack(runs)
         random = [
             scene.render("none", effort.spp, seed=FIRST_SEED + seed, **many)
             for seed in range(effort.seeds)
         ]
-        return cls(setting, scene, effort, truth, random)
+        if setting.truth is not None:
+            truth = setting.truth(effort.side, effort.truth, 16 * effort.spp, effort.threads)
+            square = _square(random)
+        else:
+            runs = [
+                scene.render("none", 16 * effort.spp, seed=seed, **many)
+                for seed in range(effort.truth)
+            ]
+            truth = np.stack([run.image for run in runs])
+            square = _square(runs)
+        return cls(setting, scene, effort, truth, random, square)
 
     def run(self, guide: str) -> list[Result]:
         """A render of the guide for each seed."""
@@ -145,26 +153,30 @@ def judge(bench: Bench, results: Sequence[Result]) -> Finding:
     if a == 0 and (z := _missing(results)) < -ERRORS:
         what = f"light is missing: {z:.0f} standard errors below the pilot's mean; {figure}"
         return finding("fails", what)
-    heavy, p = _bias(bench, images)
+    heavy, p = _bias(bench, images, results)
     numbers["p"] = p
+    unsure = ""
     # Of a mode that a few paths in all runs meet, their spread says nothing of the variance.
     if p < ALPHA / 2 and not bench.setting.blind:
         there, here = float(truth.mean()), float(images.mean())
-        what = f"{figure}; mean {here / there:.3g} of the truth, p = {p:.1g}"
-        # Where one sample holds much of the sum, neither side knows its variance, and p says little.
-        if not heavy:
-            return finding("fails", what)
-        return finding("degrades", what, "too heavy-tailed to tell bias from noise")
+        figure += f"; mean {here / there:.3g} of the truth, p = {p:.1g}"
+        # Where one sample holds much of the sum, neither side knows its variance, and p says little: but no variance is
+        # above E[f²]/a.
+        if not heavy or _bias_beyond_bound(bench, images, results, a) < ALPHA / 2:
+            return finding("fails", figure)
+        unsure = "too heavy-tailed to tell bias from noise"
     bound = numbers["bound"]
     if a > 0 and bound is not None and bound - ERRORS * error > 1.0:
         return finding("fails", f"E[(f/m)²] = {bound:.3g} · E[f²]/a")
     ratio = numbers["ratio"] or 0.0
     if a == 0 and max(ratio, numbers["mean_ratio"] or 0.0) > HOPELESS:
         return finding("fails", f"{figure}, mean of the seeds {numbers['mean_ratio']:.2g} ×")
-    if ratio <= HARMLESS:
+    if ratio <= HARMLESS and not unsure:
         return finding("holds", figure)
     silent = bench.setting.blind and (numbers["warned"] or 0.0) < 0.5
-    return finding("degrades", figure, "most renders say nothing of it" if silent else "")
+    return finding(
+        "degrades", figure, unsure or ("most renders say nothing of it" if silent else "")
+    )
 
 
 def _errors(bench: Bench, images: F32) -> dict[str, float | None]:
@@ -205,10 +217,44 @@ def _bound(bench: Bench, results: Sequence[Result], a: float) -> tuple[float | N
     return float(ratio), float(ratio * math.hypot(*spread))
 
 
-def _bias(bench: Bench, images: F32) -> tuple[bool, float]:
-    """Whether tails are too heavy for the test, and Welch's p of the means of image and tiles."""
-    compared = welch(images, bench.truth, tile=max(images.shape[1] // 2, 1))
-    return not compared.has_power, compared.p
+def _square(results: Sequence[Result]) -> float:
+    """Mean E[(f/m)²] of renders."""
+    return float(np.mean([r.stats["diagnostics"]["mean_square"] for r in results]))
+
+
+def _bias(bench: Bench, images: F32, results: Sequence[Result]) -> tuple[bool, float]:
+    """Whether tails are too heavy for the test, and p of the means of image and tiles."""
+    tile = max(images.shape[1] // 2, 1)
+    compared = welch(images, bench.truth, tile=tile)
+    # Colours of a path go together: at most so much is the deviation of their luminance.
+    variance = (np.sqrt([r.variance for r in results]) @ LUMINANCE) ** 2
+    if len(results) >= FEW_SEEDS or not np.isfinite(variance).all():
+        return not compared.has_power, compared.p
+    # Pixels are independent, and so are their samples: these are the degrees of freedom.
+    samples = len(results) * bench.effort.spp
+    height, width = variance.shape[1:]
+    heights = np.diff(np.arange(0, height, tile), append=height)
+    widths = np.diff(np.arange(0, width, tile), append=width)
+    pixels = np.outer(heights, widths)
+    noise = tile_means(variance, tile).mean(axis=0) / (len(results) * pixels)
+    whole = np.asarray(variance.mean() / (len(results) * height * width))
+    image, tiles = compared.images[0], compared.tiles[0]
+    sides = (
+        (Moments(image.mean, whole, samples * height * width), compared.images[1]),
+        (Moments(tiles.mean, noise, samples * int(pixels.min())), compared.tiles[1]),
+    )
+    p_image, p_tiles = (p_value(*side) for side in sides)
+    return not compared.has_power, float(min(p_image, holm(p_tiles).min()))
+
+
+def _bias_beyond_bound(bench: Bench, images: F32, results: Sequence[Result], a: float) -> float:
+    """The p of the image's mean if its paths had the largest variance that a allows; 1 without a bound."""
+    if a <= 0:
+        return 1.0
+    paths = sum(int(r.stats["camera_rays"]) for r in results)
+    square = max(bench.square / a, _square(results))
+    ours = Moments(np.asarray((images @ LUMINANCE).mean()), np.asarray(square / paths), paths)
+    return float(p_value(ours, Moments.of((bench.truth @ LUMINANCE).mean(axis=(1, 2)))))
 
 
 def _missing(results: Sequence[Result]) -> float:
