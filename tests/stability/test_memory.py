@@ -45,7 +45,7 @@ def _resident() -> int:
         return int(file.read().split()[1]) * resource.getpagesize()
 
 
-def _growth(renders: int) -> int:
+def growth(renders: int) -> int:
     """Bytes that this process grew by over the second half of so many renders."""
     mi.set_variant(SCALAR)
     scene = pssflow.Scene(room(40))
@@ -67,6 +67,16 @@ def _grown(work: Callable[[int], object], times: int) -> int:
     return _resident() - middle
 
 
+def _alone(call: str) -> str:
+    """What a call of this module's returns in a process of its own, whose heap no other test has filled."""
+    code = f"from tests.stability.test_memory import *; print({call})"
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
 def test_a_leak_is_seen() -> None:
     """The control: a MiB and a half that stays each time, less than the records of a guided render below."""
     kept: list[NDArray[np.uint8]] = []
@@ -78,27 +88,20 @@ def test_memory_is_flat() -> None:
     """Forty renders behind forty others: if each guided one leaked its records (25,600 paths, about 2 MB), it would be
     seen.
     """
-    assert _growth(80) < MOST_GROWTH
+    assert int(_alone("growth(80)")) < MOST_GROWTH
 
 
 @pytest.mark.long
 @pytest.mark.timeout(7200)
 def test_memory_is_flat_over_a_thousand_renders(record: dict[str, Any]) -> None:
-    record["bytes"] = float(_growth(1000))
+    record["bytes"] = float(_alone("growth(1000)"))
     assert record["bytes"] < MOST_GROWTH
 
 
 @pytest.mark.timeout(900)
 def test_memory_that_runs_out_while_learning_is_no_crash() -> None:
     """The vertices of half a million paths do not fit: fewer are kept, the image is whole, and a note says so."""
-    # A process of its own from the start: what other tests left in the heap decides how much goes into little room.
-    code = (
-        "from tests.stability.test_memory import learn_in_little; print(learn_in_little(64 << 20))"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False
-    )
-    assert done.stdout.strip() == "fewer were kept", done.stderr
+    assert _alone("learn_in_little(64 << 20)") == "fewer were kept"
 
 
 def learn_in_little(more: int) -> str:
