@@ -23,8 +23,8 @@ _status: list[int] = []
 def pytest_configure() -> None:
     """Leaves cycles to the end of the process.
 
-    Mitsuba 3.9.1 makes thousands of classes anew with each change of variant. Once in some ten thousand changes Python's
-    collector came upon one that was gone, and the process crashed in the middle of whatever test it was.
+    Mitsuba 3.9.1 makes thousands of classes anew with each change of variant. Twice in some fifty runs of these tests
+    Python's collector came upon one that was gone, and the process crashed in the middle of whatever test it was.
     """
     gc.disable()
 
