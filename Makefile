@@ -15,8 +15,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 REPORTS := out/tests
-# Folders of tests; each is run by a process of its own, see PYTEST.
-PARTS := $(sort $(patsubst tests/%/,%,$(dir $(wildcard tests/*/test_*.py))))
+# Files of tests; each is run by a process of its own, see PYTEST.
+PARTS := $(sort $(wildcard tests/*/test_*.py))
 
 # rustup's own place, for shells that have not read its profile.
 export PATH := $(PATH):$(HOME)/.cargo/bin
@@ -34,14 +34,15 @@ EXTENSION := $(wildcard python/pssflow/_core*.so)
 RUST_TEST = PSSFLOW_EMBREE_DIRS="$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("platlib"))')" \
 	cargo test --release --workspace
 
-# Runs the tests, a process for each folder, and all folders even if one fails. In one process, Python's garbage collector
-# crashed once after 1,200 tests, in Mitsuba's reload of a variant's thousands of classes; a few hundred never did.
-# Status 5 is a folder of which all tests are deselected.
+# Runs the tests, a process for each file, and all files even if one fails. Mitsuba makes thousands of classes anew with
+# each change of variant, and Python's garbage collector came upon one that was gone: once after 1,200 tests in one
+# process, once after 200. Without the collector scenes of other tests stay alive, and LLVM's kernels call their plugins.
+# Status 5 is a file of which all tests are deselected.
 define PYTEST
 @rm -rf $(REPORTS)/python
 @status=0; for part in $(PARTS); do \
-	echo "tests/$$part"; \
-	$(BIN)/python -m pytest $(1) --junitxml=$(REPORTS)/python/$$part.xml tests/$$part || \
+	echo "$$part"; \
+	$(BIN)/python -m pytest $(1) --junitxml=$(REPORTS)/python/$$(echo $$part | tr / -).xml $$part || \
 		{ code=$$?; test $$code = 5 || status=$$code; }; \
 done; exit $$status
 endef

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import json
 import os
 import re
@@ -18,15 +17,6 @@ SCALAR, LLVM = "scalar_rgb", "llvm_ad_rgb"
 
 
 _status: list[int] = []
-
-
-def pytest_configure() -> None:
-    """Leaves cycles to the end of the process.
-
-    Mitsuba 3.9.1 makes thousands of classes anew with each change of variant. Twice in some fifty runs of these tests
-    Python's collector came upon one that was gone, and the process crashed in the middle of whatever test it was.
-    """
-    gc.disable()
 
 
 def pytest_sessionfinish(exitstatus: int) -> None:
