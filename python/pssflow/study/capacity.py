@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -94,8 +93,7 @@ def capacity(
     SCENE is an XML file or a name (`scenes/door-ajar`). Writes results.csv, a table, charts and report.html to DIR; run
     again, it goes on where it stopped.
     """
-    from .command import title
-    from .harness import Study
+    from .command import conduct
     from .sceneries import named_scenes, scenery
 
     terminal.quiet = quiet
@@ -103,36 +101,23 @@ def capacity(
         raise ValueError("`--time` and `--spp` were both given; give one")
     unit = "spp" if spp else "s"
     times = spp or (seconds or 10.0,)
-    study = Study(
-        folder=Path(output),
-        sceneries=[
+    conduct(
+        terminal,
+        [
             scenery(plan, pixels, k, reference_time, not quiet, terminal.note)
             for plan in named_scenes(scenes)
         ],
-        methods=capacity_methods(k, threads, unit),
+        capacity_methods(k, threads, unit),
+        publish,
         times=times,
-        seeds=range(seeds),
-        settings={
-            "k": k,
-            "emitter_strategy": "mis",
-            "threads": threads or 0,
-            "pixels": pixels,
-            "reference_time": reference_time,
-        },
-        say=terminal.say,
-        progress=not quiet,
         unit=unit,
+        seeds=seeds,
+        pixels=pixels,
+        k=k,
+        threads=threads,
+        reference_time=reference_time,
+        output=output,
     )
-    heading = title(times, k, unit)
-    study.publish = lambda rows: publish(study, rows, heading)
-    rows = study.run()
-    if not rows:
-        raise RuntimeError(
-            "there is nothing to show: "
-            + "; ".join(f"{what}: {why}" for what, why in study.failures.items())
-        )
-    for part in publish(study, rows, heading):
-        terminal.out.print(part, highlight=False, soft_wrap=isinstance(part, str))
 
 
 def capacity_methods(

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -14,7 +14,11 @@ from ..params import GuideNames, Positive
 from ..terminal import Terminal
 from .times import Samples, Times
 
-__all__ = ["Defaults", "study_command"]
+if TYPE_CHECKING:
+    from .harness import Method, Scenery, Study
+    from .store import Row
+
+__all__ = ["Defaults", "conduct", "study_command"]
 
 
 @dataclass(frozen=True)
@@ -109,7 +113,6 @@ def _run(
     quiet: bool,
 ) -> None:
     # Mitsuba takes a second to import, and --help should not.
-    from .harness import Study
     from .methods import PATH, missing, named_method
     from .report import publish
     from .sceneries import SIX, every_scene, named_scenes, scenery
@@ -132,14 +135,53 @@ def _run(
     # Plain `path` renders all light: scenes of their own, with their truth.
     lights = [BOUNCES] * any(name != PATH for name in chosen) + [ALL] * (PATH in chosen)
     plans = named_scenes(scenes) if scenes else every_scene() if full else named_scenes(SIX)
+    sceneries = [
+        scenery(plan, pixels, k, reference_time, not quiet, terminal.note, light)
+        for plan in plans
+        for light in lights
+    ]
+    conduct(
+        terminal,
+        sceneries,
+        [named_method(name, k, threads, unit) for name in chosen],
+        publish,
+        times=times,
+        unit=unit,
+        seeds=seeds,
+        pixels=pixels,
+        k=k,
+        threads=threads,
+        reference_time=reference_time,
+        output=output,
+    )
+
+
+def conduct(
+    terminal: Terminal,
+    sceneries: Sequence[Scenery],
+    methods: Sequence[Method],
+    publish: Callable[[Study, Sequence[Row], str], Sequence[Any]],
+    *,
+    times: Sequence[float],
+    unit: str,
+    seeds: int,
+    pixels: int,
+    k: int,
+    threads: int | None,
+    reference_time: float,
+    output: str,
+) -> None:
+    """Runs what is not there yet; publishes scene after scene, and prints what `publish` returns in the end.
+
+    Raises:
+        RuntimeError: there is nothing to show; the message says why.
+    """
+    from .harness import Study
+
     study = Study(
         folder=Path(output),
-        sceneries=[
-            scenery(plan, pixels, k, reference_time, not quiet, terminal.note, light)
-            for plan in plans
-            for light in lights
-        ],
-        methods=[named_method(name, k, threads, unit) for name in chosen],
+        sceneries=sceneries,
+        methods=methods,
         times=times,
         seeds=range(seeds),
         settings={
@@ -150,7 +192,7 @@ def _run(
             "reference_time": reference_time,
         },
         say=terminal.say,
-        progress=not quiet,
+        progress=not terminal.quiet,
         unit=unit,
     )
     heading = title(times, k, unit)
