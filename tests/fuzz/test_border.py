@@ -16,7 +16,7 @@ import pytest
 
 from tests.conftest import SCALAR
 from tests.support.border import Answer, Case, exported, scene_file, write_assets
-from tests.support.workers import run_cases
+from tests.support.workers import checked, run_cases
 
 QUICK = 100
 ALL = 1000
@@ -30,20 +30,7 @@ def _check(kind: str, seeds: range, folder: Path) -> Counter[str]:
     mi.set_variant(SCALAR)
     write_assets(folder)
     cases = [Case(str(folder), seed) for seed in seeds]
-    counts: Counter[str] = Counter()
-    bad = []
-    for outcome in run_cases(KINDS[kind], cases, seconds=SECONDS):
-        if outcome.death and outcome.stage == "mitsuba":
-            counts["Mitsuba died"] += 1
-        elif outcome.death:
-            bad.append(f"{outcome.case.seed}: {outcome.death} while in {outcome.stage!r}")
-        elif outcome.answer.kind == "bad":
-            bad.append(f"{outcome.case.seed}: {outcome.answer.text}")
-        else:
-            counts[outcome.answer.kind] += 1
-    assert not bad, f"{len(bad)} of {len(cases)} {kind}:\n" + "\n".join(bad[:20])
-    assert counts.total() == len(cases)
-    return counts
+    return checked(kind, KINDS[kind], cases, seconds=SECONDS, excused="mitsuba")
 
 
 @pytest.mark.parametrize("kind", KINDS)

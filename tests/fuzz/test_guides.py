@@ -16,7 +16,7 @@ import pytest
 from tests.conftest import SCALAR
 from tests.support.border import Answer, Case
 from tests.support.guides import SMALL, guide_file, options, write_guides
-from tests.support.workers import run_cases
+from tests.support.workers import checked
 
 QUICK = 150
 ALL = 12_000
@@ -29,18 +29,7 @@ def _check(kind: str, seeds: range, folder: Path) -> Counter[str]:
     mi.set_variant(SCALAR)
     write_guides(folder)
     cases = [Case(str(folder), seed) for seed in seeds]
-    counts: Counter[str] = Counter()
-    bad = []
-    for outcome in run_cases(KINDS[kind], cases, seconds=SECONDS):
-        if outcome.death:
-            bad.append(f"{outcome.case.seed}: {outcome.death} while in {outcome.stage!r}")
-        elif outcome.answer.kind == "bad":
-            bad.append(f"{outcome.case.seed}: {outcome.answer.text}")
-        else:
-            counts[outcome.answer.kind] += 1
-    assert not bad, f"{len(bad)} of {len(cases)} {kind}:\n" + "\n".join(bad[:20])
-    assert counts.total() == len(cases)
-    return counts
+    return checked(kind, KINDS[kind], cases, seconds=SECONDS)
 
 
 @pytest.mark.parametrize("kind", KINDS)

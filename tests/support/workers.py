@@ -9,6 +9,7 @@ from __future__ import annotations
 import multiprocessing
 import resource
 import signal
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -89,3 +90,31 @@ def _work(answers: Connection, function: Callable[..., Any], cases: Sequence[Any
     for case in cases:
         answer = function(case, lambda stage: answers.send(("stage", stage)))
         answers.send(("answer", answer))
+
+
+def checked(
+    kind: str,
+    function: Callable[[Any, Callable[[str], None]], Any],
+    cases: Sequence[Any],
+    *,
+    seconds: float,
+    excused: str | None = None,
+) -> Counter[str]:
+    """How often each kind of answer came; asserts that no case died, or answered `bad`.
+
+    Deaths in the stage `excused` are counted apart, as "Mitsuba died".
+    """
+    counts: Counter[str] = Counter()
+    bad = []
+    for outcome in run_cases(function, cases, seconds=seconds):
+        if outcome.death and outcome.stage == excused:
+            counts["Mitsuba died"] += 1
+        elif outcome.death:
+            bad.append(f"{outcome.case.seed}: {outcome.death} while in {outcome.stage!r}")
+        elif outcome.answer.kind == "bad":
+            bad.append(f"{outcome.case.seed}: {outcome.answer.text}")
+        else:
+            counts[outcome.answer.kind] += 1
+    assert not bad, f"{len(bad)} of {len(cases)} {kind}:\n" + "\n".join(bad[:20])
+    assert counts.total() == len(cases)
+    return counts
