@@ -115,10 +115,10 @@ pub struct Selection {
 /// None that the registry of this build does not cause.
 pub fn candidates() -> Result<Vec<Recipe>, GuideError> {
     let stiff = json!({
-        "direction-table": { "kappa": 32.0 },
-        "emitter-table": { "kappa": 32.0 },
-        "light-table": { "kappa": 32.0 },
-        "ray-table": { "kappa": 32.0 },
+        "direction-table": { "kappa": 64.0 },
+        "emitter-table": { "kappa": 64.0 },
+        "light-table": { "kappa": 64.0 },
+        "ray-table": { "kappa": 64.0 },
     });
     let stiff = stiff.as_object().cloned().unwrap_or_default();
     Ok(vec![

@@ -1,10 +1,12 @@
 //! Tables and where they apply: fitted, looked up, stored.
 
+use std::ops::Range;
+
 use rayon::prelude::*;
 
 use super::cells::{CellMap, Grid, MOST_DEPTH};
 use super::line::{Line, Lines};
-use super::square::{self, Square};
+use super::square::{self, STAGE, Square};
 use super::tree::{self, Row};
 use crate::Context;
 use crate::file::Contents;
@@ -49,15 +51,40 @@ pub(super) struct Bank<T> {
 pub(super) struct Squares {
     pub(super) bins: usize,
     entries: Vec<u16>,
+    /// First entry: the tables begin where a cache line does, so that none of their rows lies in two.
+    start: usize,
 }
 
 impl Squares {
-    /// Gives back what the entries have room for beyond their number.
-    fn new(bins: usize, mut entries: Vec<u16>) -> Self {
-        entries.shrink_to_fit();
-        Self { bins, entries }
+    /// Tables one behind the other.
+    fn new(bins: usize, tables: &[u16]) -> Self {
+        let mut entries = vec![0; tables.len() + CACHE_LINE / size_of::<u16>()];
+        let start = entries.as_ptr().align_offset(CACHE_LINE);
+        // The offset may be unknown, by its definition; then nothing is aligned.
+        let start = start.min(entries.len() - tables.len());
+        entries[start..start + tables.len()].copy_from_slice(tables);
+        entries.truncate(start + tables.len());
+        Self {
+            bins,
+            entries,
+            start,
+        }
+    }
+
+    fn entries(&self) -> &[u16] {
+        &self.entries[self.start..]
+    }
+
+    /// Table number `i`.
+    #[inline]
+    fn table(&self, i: usize) -> Option<&[u16]> {
+        let size = Square::entries(self.bins);
+        self.entries().get(i * size..(i + 1) * size)
     }
 }
+
+/// Bytes.
+const CACHE_LINE: usize = 64;
 
 impl<T> Bank<T> {
     fn new(grid: Grid, oriented: bool, mut keys: Vec<u64>, fewest_rows: usize, tables: T) -> Self {
@@ -79,6 +106,29 @@ impl<T> Bank<T> {
             .grid
             .key(group, self.oriented, &context.position, &context.normal);
         self.map.find(&self.grid, key)
+    }
+
+    /// Calls `work` for a few rows at a time with their cells; `group` says which group's serves a context, and is `None`
+    /// where none of this bank does. Rows are looked up together, so that the processor waits for their memory at once.
+    #[inline]
+    fn each_cell(
+        &self,
+        contexts: &[Context],
+        rows: usize,
+        group: impl Fn(&Context) -> Option<u32>,
+        mut work: impl FnMut(Range<usize>, &[Option<usize>]),
+    ) {
+        let nowhere = Context::default();
+        for start in (0..rows).step_by(STAGE) {
+            let here = start..rows.min(start + STAGE);
+            let mut cells = [None; STAGE];
+            for (cell, row) in cells.iter_mut().zip(here.clone()) {
+                let context = contexts.get(row).unwrap_or(&nowhere);
+                *cell = group(context).and_then(|group| self.find(group, context));
+            }
+            let count = here.len();
+            work(here, &cells[..count]);
+        }
     }
 
     /// Cells, what the finest grid has per axis, and rows that a cell needed.
@@ -180,7 +230,7 @@ impl Bank<Squares> {
         progress: &mut dyn FnMut(f32) -> bool,
     ) -> Option<Self> {
         let bank = Bank::fit_with(&leaves, plan, examples, progress)?;
-        let tables = Squares::new(leaves.bins, bank.tables);
+        let tables = Squares::new(leaves.bins, &bank.tables);
         Some(Self::new(
             bank.grid,
             bank.oriented,
@@ -190,43 +240,64 @@ impl Bank<Squares> {
         ))
     }
 
+    /// Calls `work` for a few rows at a time with their tables.
     #[inline]
-    fn table(&self, group: u32, context: &Context) -> Option<&[u16]> {
-        let size = Square::entries(self.tables.bins);
-        let at = self.find(group, context)? * size;
-        self.tables.entries.get(at..at + size)
+    fn each(
+        &self,
+        contexts: &[Context],
+        rows: usize,
+        group: impl Fn(&Context) -> Option<u32>,
+        mut work: impl FnMut(Range<usize>, &[Option<&[u16]>]),
+    ) {
+        self.each_cell(contexts, rows, group, |here, cells| {
+            let mut tables = [None; STAGE];
+            for (table, cell) in tables.iter_mut().zip(cells) {
+                *table = cell.and_then(|cell| self.tables.table(cell));
+            }
+            work(here, &tables[..cells.len()]);
+        });
     }
 
-    /// Turns a uniform pair into a guided one; its density.
-    #[inline]
-    pub(super) fn sample(&self, group: u32, context: &Context, u: &mut [f32; 2]) -> f32 {
-        let Some(table) = self.table(group, context) else {
-            return 1.0;
+    /// Turns uniform pairs into guided ones, with their densities; where no table serves a row it stays as it is.
+    pub(super) fn sample(
+        &self,
+        contexts: &[Context],
+        u: &mut [[f32; 2]],
+        q: &mut [f32],
+        group: impl Fn(&Context) -> Option<u32>,
+    ) {
+        let sample = match self.tables.bins {
+            4 => square::sample::<4>,
+            8 => square::sample::<8>,
+            16 => square::sample::<16>,
+            _ => square::sample::<32>,
         };
-        match self.tables.bins {
-            4 => square::sample::<4>(table, u),
-            8 => square::sample::<8>(table, u),
-            16 => square::sample::<16>(table, u),
-            _ => square::sample::<32>(table, u),
-        }
+        self.each(contexts, q.len(), group, |rows, tables| {
+            sample(tables, &mut u[rows.clone()], &mut q[rows]);
+        });
     }
 
-    /// Density of a pair.
-    #[inline]
-    pub(super) fn density(&self, group: u32, context: &Context, u: &[f32; 2]) -> f32 {
-        let Some(table) = self.table(group, context) else {
-            return 1.0;
+    /// Densities of pairs; where no table serves a row that of the row stays.
+    pub(super) fn density(
+        &self,
+        contexts: &[Context],
+        u: &[[f32; 2]],
+        q: &mut [f32],
+        group: impl Fn(&Context) -> Option<u32>,
+    ) {
+        let density = match self.tables.bins {
+            4 => square::density::<4>,
+            8 => square::density::<8>,
+            16 => square::density::<16>,
+            _ => square::density::<32>,
         };
-        match self.tables.bins {
-            4 => square::density::<4>(table, u),
-            8 => square::density::<8>(table, u),
-            16 => square::density::<16>(table, u),
-            _ => square::density::<32>(table, u),
-        }
+        self.each(contexts, q.len(), group, |rows, tables| {
+            density(tables, &u[rows.clone()], &mut q[rows]);
+        });
     }
 
     pub(super) fn entries(&self) -> usize {
-        self.tables.entries.len()
+        self.tables.entries().len()
     }
 
     pub(super) fn bytes(&self) -> usize {
@@ -235,7 +306,7 @@ impl Bank<Squares> {
 
     pub(super) fn put(&self, prefix: &str, contents: &mut Contents) {
         self.store(prefix, contents);
-        let (pairs, _) = self.tables.entries.as_chunks::<2>();
+        let (pairs, _) = self.tables.entries().as_chunks::<2>();
         let packed = pairs
             .iter()
             .map(|p| u32::from(p[0]) | u32::from(p[1]) << 16);
@@ -267,9 +338,9 @@ impl Bank<Squares> {
                 "tensor {prefix}tables holds an interval that is empty"
             ));
         }
-        let tables = Squares::new(bins, entries);
+        let tables = Squares::new(bins, &entries);
         let bank = Bank::restore_with(prefix, contents, tables)?;
-        if bank.keys.len() * size != bank.tables.entries.len() {
+        if bank.keys.len() * size != bank.tables.entries().len() {
             return Err(format!(
                 "tensors {prefix}keys and {prefix}tables disagree in length"
             ));
@@ -288,6 +359,38 @@ impl Bank<Lines> {
         let mut bank = Bank::fit_with(leaves, plan, examples, progress)?;
         bank.tables.shrink_to_fit();
         Some(bank)
+    }
+
+    /// Turns uniform numbers into guided ones, with their densities; where no table serves a row it stays as it is.
+    pub(super) fn sample(&self, contexts: &[Context], u: &mut [f32], q: &mut [f32]) {
+        self.each_cell(
+            contexts,
+            q.len(),
+            |_| Some(0),
+            |rows, cells| {
+                for ((u, q), cell) in u[rows.clone()].iter_mut().zip(&mut q[rows]).zip(cells) {
+                    if let Some(cell) = cell {
+                        *q = self.tables.sample(*cell, u);
+                    }
+                }
+            },
+        );
+    }
+
+    /// Densities of numbers; where no table serves a row that of the row stays.
+    pub(super) fn density(&self, contexts: &[Context], u: &[f32], q: &mut [f32]) {
+        self.each_cell(
+            contexts,
+            q.len(),
+            |_| Some(0),
+            |rows, cells| {
+                for ((u, q), cell) in u[rows.clone()].iter().zip(&mut q[rows]).zip(cells) {
+                    if let Some(cell) = cell {
+                        *q = self.tables.density(*cell, *u);
+                    }
+                }
+            },
+        );
     }
 
     pub(super) fn entries(&self) -> usize {

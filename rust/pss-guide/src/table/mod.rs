@@ -64,6 +64,16 @@ impl Kind {
         }
     }
 
+    /// Paths that the parent cell's distribution counts for where no option says it (ARCHITECTURE.md tells why so many).
+    const fn kappa(self) -> f64 {
+        match self {
+            Self::Direction => 16.0,
+            Self::Emitter => 8.0,
+            Self::Light => 32.0,
+            Self::Ray => 64.0,
+        }
+    }
+
     /// Options with their defaults.
     pub(crate) fn defaults(self) -> Map<String, Value> {
         match self {
@@ -96,13 +106,31 @@ enum Tables {
     /// Of a pair at a vertex; groups are bounces.
     Vertex(Bank<Squares>),
     Emitter(Bank<Lines>),
-    /// Groups are emitters.
-    Light {
-        area: Bank<Squares>,
-        environment: Bank<Squares>,
-        /// By emitter: whether its tables are among the environments'.
-        surrounds: Vec<bool>,
-    },
+    Light(Lights),
+}
+
+/// Tables of the pairs on emitters; groups are emitters.
+#[derive(Debug)]
+struct Lights {
+    area: Bank<Squares>,
+    environment: Bank<Squares>,
+    /// By emitter: whether its tables are among the environments'.
+    surrounds: Vec<bool>,
+}
+
+impl Lights {
+    /// The banks that hold tables, and whether of environments.
+    fn banks(&self) -> impl Iterator<Item = (&Bank<Squares>, bool)> {
+        let both = [(&self.area, false), (&self.environment, true)];
+        both.into_iter().filter(|(bank, _)| bank.entries() > 0)
+    }
+
+    /// The group of a context in the bank of that side.
+    #[inline]
+    fn group(&self, context: &Context, environment: bool) -> Option<u32> {
+        let around = self.surrounds.get(context.emitter as usize) == Some(&true);
+        (around == environment).then_some(context.emitter)
+    }
 }
 
 /// A table as a guide.
@@ -133,7 +161,7 @@ impl TableGuide {
         stage(0.2)?;
 
         let paths = records.paths();
-        let (kappa, depth) = (options.kappa(paths), options.depth(paths));
+        let (kappa, depth) = (options.kappa.unwrap_or(kind.kappa()), options.depth(paths));
         let square = |bins| Square { bins, kappa };
         let plan = Plan {
             depth,
@@ -185,12 +213,13 @@ impl TableGuide {
                 }
                 let environment = banks.pop();
                 let area = banks.pop();
-                area.zip(environment)
-                    .map(|(area, environment)| Tables::Light {
+                area.zip(environment).map(|(area, environment)| {
+                    Tables::Light(Lights {
                         area,
                         environment,
                         surrounds,
                     })
+                })
             }
         };
         let tables = tables.ok_or(GuideError::Cancelled)?;
@@ -231,12 +260,12 @@ impl TableGuide {
                 Tables::Vertex(Bank::<Squares>::restore("", bins(0)?, &mut contents)?)
             }
             Kind::Emitter => Tables::Emitter(Bank::<Lines>::restore("", &mut contents)?),
-            Kind::Light => Tables::Light {
+            Kind::Light => Tables::Light(Lights {
                 area: Bank::<Squares>::restore("area.", bins(0)?, &mut contents)?,
                 environment: Bank::<Squares>::restore("environment.", bins(1)?, &mut contents)?,
                 surrounds: serde_json::from_value(config["environments"].clone())
                     .map_err(|e| format!("its configuration's `environments`: {e}"))?,
-            },
+            }),
         };
         let reals = contents.tensors.first().map(|t| &t.0);
         if let Some(name) = reals.or(contents.words.first().map(|t| &t.0)) {
@@ -250,19 +279,6 @@ impl TableGuide {
         }))
     }
 
-    /// Applies `pair` or `number` to each row with its context, and writes the densities.
-    fn each<U>(
-        contexts: &[Context],
-        rows: impl Iterator<Item = U>,
-        q: &mut [f32],
-        density: impl Fn(&Context, U) -> f32,
-    ) {
-        let nowhere = Context::default();
-        for (i, (u, q)) in rows.zip(q).enumerate() {
-            *q = density(contexts.get(i).unwrap_or(&nowhere), u);
-        }
-    }
-
     fn facts(&self) -> (Vec<(usize, usize, usize)>, usize, usize) {
         let squares = |banks: &[&Bank<Squares>]| {
             (
@@ -273,26 +289,9 @@ impl TableGuide {
         };
         match &self.tables {
             Tables::Vertex(bank) => squares(&[bank]),
-            Tables::Light {
-                area, environment, ..
-            } => squares(&[area, environment]),
+            Tables::Light(lights) => squares(&[&lights.area, &lights.environment]),
             Tables::Emitter(bank) => (vec![bank.facts()], bank.entries(), bank.bytes()),
         }
-    }
-}
-
-/// The bank that serves an emitter.
-#[inline]
-fn side<'a>(
-    area: &'a Bank<Squares>,
-    environment: &'a Bank<Squares>,
-    surrounds: &[bool],
-    emitter: u32,
-) -> &'a Bank<Squares> {
-    if surrounds.get(emitter as usize) == Some(&true) {
-        environment
-    } else {
-        area
     }
 }
 
@@ -310,61 +309,41 @@ impl Guide for TableGuide {
     }
 
     fn sample(&self, decision: Decision, contexts: &[Context], u: &mut [f32], q: &mut [f32]) {
+        q.fill(1.0);
         if !self.models().contains(&decision) {
-            return q.fill(1.0);
+            return;
         }
         match &self.tables {
             Tables::Vertex(bank) => {
-                let (pairs, _) = u.as_chunks_mut::<2>();
-                Self::each(contexts, pairs.iter_mut(), q, |c, u| {
-                    bank.sample(c.bounce, c, u)
-                });
+                let pairs = u.as_chunks_mut::<2>().0;
+                bank.sample(contexts, pairs, q, |c| Some(c.bounce));
             }
-            Tables::Emitter(bank) => {
-                Self::each(contexts, u.iter_mut(), q, |c, u| {
-                    bank.find(0, c)
-                        .map_or(1.0, |cell| bank.tables.sample(cell, u))
-                });
-            }
-            Tables::Light {
-                area,
-                environment,
-                surrounds,
-            } => {
-                let (pairs, _) = u.as_chunks_mut::<2>();
-                Self::each(contexts, pairs.iter_mut(), q, |c, u| {
-                    side(area, environment, surrounds, c.emitter).sample(c.emitter, c, u)
-                });
+            Tables::Emitter(bank) => bank.sample(contexts, u, q),
+            Tables::Light(lights) => {
+                let pairs = u.as_chunks_mut::<2>().0;
+                for (bank, environment) in lights.banks() {
+                    bank.sample(contexts, pairs, q, |c| lights.group(c, environment));
+                }
             }
         }
     }
 
     fn density(&self, decision: Decision, contexts: &[Context], u: &[f32], q: &mut [f32]) {
+        q.fill(1.0);
         if !self.models().contains(&decision) {
-            return q.fill(1.0);
+            return;
         }
         match &self.tables {
             Tables::Vertex(bank) => {
-                let (pairs, _) = u.as_chunks::<2>();
-                Self::each(contexts, pairs.iter(), q, |c, u| {
-                    bank.density(c.bounce, c, u)
-                });
+                let pairs = u.as_chunks::<2>().0;
+                bank.density(contexts, pairs, q, |c| Some(c.bounce));
             }
-            Tables::Emitter(bank) => {
-                Self::each(contexts, u.iter(), q, |c, &u| {
-                    bank.find(0, c)
-                        .map_or(1.0, |cell| bank.tables.density(cell, u))
-                });
-            }
-            Tables::Light {
-                area,
-                environment,
-                surrounds,
-            } => {
-                let (pairs, _) = u.as_chunks::<2>();
-                Self::each(contexts, pairs.iter(), q, |c, u| {
-                    side(area, environment, surrounds, c.emitter).density(c.emitter, c, u)
-                });
+            Tables::Emitter(bank) => bank.density(contexts, u, q),
+            Tables::Light(lights) => {
+                let pairs = u.as_chunks::<2>().0;
+                for (bank, environment) in lights.banks() {
+                    bank.density(contexts, pairs, q, |c| lights.group(c, environment));
+                }
             }
         }
     }
@@ -374,11 +353,9 @@ impl Guide for TableGuide {
             _ if !self.models().contains(&decision) => None,
             Tables::Vertex(bank) => bank.find(context.bounce, context),
             Tables::Emitter(bank) => bank.find(0, context),
-            Tables::Light {
-                area,
-                environment,
-                surrounds,
-            } => side(area, environment, surrounds, context.emitter).find(context.emitter, context),
+            Tables::Light(lights) => lights
+                .banks()
+                .find_map(|(bank, side)| bank.find(lights.group(context, side)?, context)),
         }
     }
 
@@ -420,11 +397,11 @@ impl Guide for TableGuide {
                 bank.put("", &mut contents);
             }
             Tables::Emitter(bank) => bank.put("", &mut contents),
-            Tables::Light {
+            Tables::Light(Lights {
                 area,
                 environment,
                 surrounds,
-            } => {
+            }) => {
                 contents.config["bins"] = json!([area.tables.bins, environment.tables.bins]);
                 contents.config["environments"] = json!(surrounds);
                 area.put("area.", &mut contents);

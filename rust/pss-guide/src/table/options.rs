@@ -11,7 +11,8 @@ use crate::{GuideError, options};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TableOptions {
-    /// Paths that the parent cell's distribution counts for, in (0, 10⁶]. (Default: 8, above 10⁶ paths 4)
+    /// Paths that the parent cell's distribution counts for, in (0, 10⁶]. (Default: 16 of a direction, 32 of a light's pair,
+    /// 64 of the BSDF-sampled ray's)
     pub kappa: Option<f64>,
     /// Bins for each of the two numbers, 4, 8, 16 or 32; on area lights at most 8. (Default: 16, above 10⁶ paths 32)
     pub bins: Option<usize>,
@@ -28,7 +29,7 @@ pub struct TableOptions {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct EmitterTableOptions {
-    /// As in [`TableOptions`].
+    /// As in [`TableOptions`]. (Default: 8)
     pub kappa: Option<f64>,
     /// As in [`TableOptions`].
     pub depth: Option<usize>,
@@ -102,11 +103,6 @@ impl TableOptions {
             "a number in (0, 1]",
         )?;
         Ok(self)
-    }
-
-    /// κ for a number of paths.
-    pub(super) fn kappa(&self, paths: f64) -> f64 {
-        self.kappa.unwrap_or(if paths > 1e6 { 4.0 } else { 8.0 })
     }
 
     /// Bins for a number of paths.

@@ -225,31 +225,43 @@ fn parts<const B: usize>(table: &[u16]) -> Option<(&[u16; B], &[[u16; B]])> {
     Some((first, rest.as_chunks::<B>().0))
 }
 
-/// Turns a uniform pair into one of the table; its density.
-#[inline]
-pub(super) fn sample<const B: usize>(table: &[u16], u: &mut [f32; 2]) -> f32 {
-    let Some((first, second)) = parts::<B>(table) else {
-        return 1.0;
-    };
-    let (i, y0, units0) = pick(first, u[0]);
-    let (_, y1, units1) = pick(&second[i], u[1]);
-    *u = [y0 / B as f32, y1 / B as f32];
-    leaf_density::<B>(units0, units1)
+/// Most rows that are sampled at once.
+pub(super) const STAGE: usize = 64;
+
+/// Turns uniform pairs into those of their tables, with their densities; where there is no table a row stays as it is.
+/// All first numbers come before the second ones: what these wait for, memory, rows then wait for together.
+pub(super) fn sample<const B: usize>(tables: &[Option<&[u16]>], u: &mut [[f32; 2]], q: &mut [f32]) {
+    let mut first = [(0, 0.0); STAGE];
+    for ((table, u), first) in tables.iter().zip(&mut *u).zip(&mut first) {
+        if let Some((ends, _)) = table.and_then(parts::<B>) {
+            let (i, y, units) = pick(ends, u[0]);
+            u[0] = y / B as f32;
+            *first = (i, units);
+        }
+    }
+    for (((table, u), q), &(i, units0)) in tables.iter().zip(u).zip(q).zip(&first) {
+        if let Some((_, second)) = table.and_then(parts::<B>) {
+            let (_, y, units1) = pick(&second[i], u[1]);
+            u[1] = y / B as f32;
+            *q = leaf_density::<B>(units0, units1);
+        }
+    }
 }
 
-/// Density of a pair; 0 outside the square.
-#[inline]
-pub(super) fn density<const B: usize>(table: &[u16], u: &[f32; 2]) -> f32 {
-    let Some((first, second)) = parts::<B>(table) else {
-        return 1.0;
-    };
-    let [i, j] = u.map(|u| bin(u, B));
-    let (_, units0) = interval(first, i);
-    let (_, units1) = interval(&second[i], j);
-    let inside = u.iter().all(|u| (0.0..1.0).contains(u));
-    if inside {
-        leaf_density::<B>(units0, units1)
-    } else {
-        0.0
+/// Densities of pairs, 0 outside the square; where there is no table that of the row stays.
+pub(super) fn density<const B: usize>(tables: &[Option<&[u16]>], u: &[[f32; 2]], q: &mut [f32]) {
+    for ((table, u), q) in tables.iter().zip(u).zip(q) {
+        let Some((first, second)) = table.and_then(parts::<B>) else {
+            continue;
+        };
+        let [i, j] = u.map(|u| bin(u, B));
+        let (_, units0) = interval(first, i);
+        let (_, units1) = interval(&second[i], j);
+        let inside = u.iter().all(|u| (0.0..1.0).contains(u));
+        *q = if inside {
+            leaf_density::<B>(units0, units1)
+        } else {
+            0.0
+        };
     }
 }
