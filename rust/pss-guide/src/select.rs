@@ -19,7 +19,7 @@ use crate::{Context, Decision, Emitter, Fit, Guide, GuideError, Recipe, Records}
 /// Shares of uniform paths that are tried.
 const FRACTIONS: [f32; 3] = [0.1, 0.25, 0.5];
 
-/// A guide must gain as much, costs deducted, and the more the fewer held-out paths promise it; see [`least_gain`].
+/// A guide must gain as much, costs deducted, and on the held-out paths the more the fewer these are; see [`least_gain`].
 const LEAST_GAIN: f64 = 1.05;
 
 /// A smaller model is taken where it comes as close to the best.
@@ -188,19 +188,14 @@ pub fn select(
         }
     }
     considered.sort_by(|x, y| y.report.net_gain.total_cmp(&x.report.net_gain));
-    let best = considered[0].report.net_gain;
-    let smallest = considered
-        .iter()
-        .enumerate()
-        .filter(|(_, c)| c.report.net_gain >= AS_GOOD * best)
-        .min_by_key(|(_, c)| c.size());
-    let mut at = smallest.map_or(0, |(i, _)| i);
-    if considered[at].report.net_gain < least {
-        at = considered
-            .iter()
-            .position(|c| c.recipe.is_none())
-            .unwrap_or(0);
-    }
+    let pays = |c: &&Considered| c.pays(least);
+    let best = considered.iter().find(pays);
+    let best = best.map_or(1.0, |c| c.report.net_gain);
+    let smallest = (0..considered.len())
+        .filter(|&i| considered[i].pays(least) && considered[i].report.net_gain >= AS_GOOD * best)
+        .min_by_key(|&i| considered[i].size());
+    let none = considered.iter().position(|c| c.recipe.is_none());
+    let at = smallest.or(none).unwrap_or(0);
     explain(&mut considered, at, best, least);
     let chosen = &considered[at];
     let mut selection = Selection {
@@ -237,6 +232,12 @@ impl Considered {
                 why: String::new(),
             },
         }
+    }
+
+    /// Whether it surely gains, on the held-out paths alone, and is worth its cost with what later passes are foreseen to
+    /// teach: foresight multiplies chance, too.
+    fn pays(&self, least: f64) -> bool {
+        self.report.predicted_gain >= least && self.report.net_gain >= LEAST_GAIN
     }
 
     /// Number of factors.
@@ -389,16 +390,17 @@ fn explain(considered: &mut [Considered], at: usize, best: f64, least: f64) {
     for (i, c) in considered.iter_mut().enumerate() {
         c.report.chosen = i == at;
         let net = c.report.net_gain;
+        let pays = c.pays(least);
         c.report.why = if i == at {
             match c.recipe {
-                None => format!("nothing surely gains {least_percent:.0} % after its cost"),
+                None => format!("nothing surely gains {least_percent:.0} % and is worth its cost"),
                 Some(_) if net < best => "as good as the best, and smaller".to_owned(),
                 Some(_) => "the largest gain after its cost".to_owned(),
             }
         } else if c.recipe.is_none() {
             "random numbers, for comparison".to_owned()
-        } else if net < least {
-            format!("gains less than {least_percent:.0} % after its cost")
+        } else if !pays {
+            format!("does not surely gain {least_percent:.0} %, or not its cost")
         } else if net >= AS_GOOD * best {
             "no better than a smaller model".to_owned()
         } else {

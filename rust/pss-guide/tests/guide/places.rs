@@ -65,7 +65,7 @@ fn each_guide_gains_alone_and_more_bounces_gain_more() {
         ("emitter-table", 1.15),
         ("light-table", 1.15),
         ("ray-table", 1.15),
-        ("table", 8.0),
+        ("table", 5.0),
     ] {
         let guide = fit(name, &Map::new(), &paths.records(), 1, &mut |_| true)
             .unwrap()
