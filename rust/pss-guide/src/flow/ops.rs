@@ -9,10 +9,10 @@ use candle_core::{
     CpuStorage, CustomOp1, CustomOp2, CustomOp3, Error, Layout, Result, Shape, Storage, Tensor,
 };
 
-use super::kernel::SLOPE;
 use super::options::Prior;
-use super::product::{Strided, multiply};
 use super::weights::kept;
+use crate::kernel::layer::SLOPE;
+use crate::kernel::product::{Strided, multiply};
 
 /// ln q given to a row outside the hypercube prior's support, where q = 0: about ln of the smallest f32.
 const LN_ZERO: f64 = -87.0;

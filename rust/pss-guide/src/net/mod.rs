@@ -11,8 +11,6 @@
 //! composite it is fitted on f²/g of what the factors before it leave, as every guide is ([`crate::Recipe::fit`]). Learned mixtures
 //! for path guiding: Huang et al. 2024, doi:10.1145/3649310; here over primary numbers, so that the BSDF is part of what is learnt.
 
-mod lanes;
-mod math;
 mod mixture;
 mod mlp;
 mod model;

@@ -10,9 +10,9 @@ use pulp::{Simd, WithSimd};
 /// A matrix seen through strides: element (i, j) is `values[i * row + j * column]`.
 #[derive(Clone, Copy)]
 pub(crate) struct Strided<'a> {
-    pub(super) values: &'a [f32],
-    pub(super) row: usize,
-    pub(super) column: usize,
+    pub(crate) values: &'a [f32],
+    pub(crate) row: usize,
+    pub(crate) column: usize,
 }
 
 impl<'a> Strided<'a> {
@@ -37,12 +37,7 @@ impl<'a> Strided<'a> {
 
 /// C (m, n) = A (m, k) · B (k, n), C row-major.
 pub(crate) fn multiply(c: &mut [f32], [m, k, n]: [usize; 3], a: Strided<'_>, b: Strided<'_>) {
-    let product = Product { c, m, k, n, a, b };
-    #[cfg(target_arch = "x86_64")]
-    if let Some(simd) = pulp::x86::V3::try_new() {
-        return Simd::vectorize(simd, product);
-    }
-    pulp::Arch::new().dispatch(product);
+    super::dispatch(Product { c, m, k, n, a, b });
 }
 
 struct Product<'a, 'c> {
