@@ -25,7 +25,10 @@ fn floats<'a>(storage: &'a CpuStorage, layout: &Layout) -> Result<&'a [f32]> {
 }
 
 /// Runs `f` on the values of contiguous CPU tensors.
-fn with<const N: usize, R>(tensors: [&Tensor; N], f: impl FnOnce([&[f32]; N]) -> R) -> Result<R> {
+pub(super) fn with<const N: usize, R>(
+    tensors: [&Tensor; N],
+    f: impl FnOnce([&[f32]; N]) -> R,
+) -> Result<R> {
     let tensors = tensors.map(|t| t.contiguous());
     let mut owned = Vec::with_capacity(N);
     for t in tensors {

@@ -1,22 +1,26 @@
 //! Maximum likelihood by Adam (Kingma and Ba 2015, arXiv:1412.6980) on candle's graph.
 //!
 //! Weights live in plain vectors; each step builds the graph from fresh tensors of them, asks candle for
-//! the gradients and updates the vectors. A large batch goes through the graph in parts, because candle
-//! hands elementwise work on more than 65,536 numbers to a spinning thread pool, which collapses when
-//! other work wants the cores. So training stays on the caller's thread, and the same seed gives the same
-//! weights for any number of threads.
+//! the gradients and updates the vectors. A batch is cut into parts of fixed size, each with a graph of its own, that any
+//! number of rayon's threads may compute; their sums are added in order, so that the same seed gives the same weights for
+//! any number of threads. Parts are small enough that candle's own thread pool stays out: it takes elementwise work on more
+//! than 65,536 numbers, spins, and collapses when other work wants the cores.
 
 use candle_core::{Device, Result as TensorResult, Tensor, Var};
 use pss_rng::{Purpose, Stream};
+use rayon::prelude::*;
 
 use super::Domain;
-use super::ops::{Affine, Condition, Linear, NegLogLikelihood};
+use super::ops::{Affine, Condition, Linear, NegLogLikelihood, with};
 use super::options::RealNvpOptions;
 use super::weights::Weights;
 use crate::{EpochLoss, GuideError};
 
 /// Most activations of a layer in one part of a batch.
-const PART: usize = 32_768;
+const ACTIVATIONS: usize = 32_768;
+
+/// Most rows of one part: half of the usual batch, for two threads. Each part costs a gradient of all weights.
+const PART: usize = 128;
 
 /// Weights after the last epoch, and the loss of each.
 pub(super) struct Trained {
@@ -131,23 +135,35 @@ pub(super) fn gradients(
         .zip(&weights.tensors)
         .map(|((_, size), values)| Var::from_slice(values, size, &Device::Cpu))
         .collect::<TensorResult<_>>()?;
+    let most = ACTIVATIONS / shape.hidden.max(shape.dims);
+    let parts: Vec<_> = rows
+        .par_chunks(most.clamp(1, PART))
+        .map(|part| {
+            let share = part.len() as f64 / rows.len() as f64;
+            let loss = loss(options, weights, &vars, x, part)?;
+            let value = f64::from(loss.to_scalar::<f32>()?);
+            let gradients = match value.is_finite() {
+                true => Some(loss.backward()?),
+                false => None,
+            };
+            Ok((share, value, gradients))
+        })
+        .collect::<TensorResult<_>>()?;
+    let value = parts.iter().map(|(share, value, _)| share * value).sum();
+    if !f64::is_finite(value) {
+        return Ok((value, Vec::new()));
+    }
     let mut sums: Vec<Vec<f32>> = weights.tensors.iter().map(|t| vec![0.0; t.len()]).collect();
-    let mut value = 0.0;
-    for part in rows.chunks((PART / shape.hidden.max(shape.dims)).max(1)) {
-        let share = part.len() as f64 / rows.len() as f64;
-        let loss = loss(options, weights, &vars, x, part)?;
-        value += share * f64::from(loss.to_scalar::<f32>()?);
-        if !value.is_finite() {
-            return Ok((value, Vec::new()));
-        }
-        let gradients = loss.backward()?;
+    for (share, _, gradients) in &parts {
+        let share = *share as f32;
         for (var, sum) in vars.iter().zip(&mut sums) {
-            if let Some(gradient) = gradients.get(var) {
-                let gradient = gradient.flatten_all()?.to_vec1::<f32>()?;
-                sum.iter_mut()
-                    .zip(&gradient)
-                    .for_each(|(s, g)| *s += share as f32 * g);
-            }
+            let Some(gradient) = gradients.as_ref().and_then(|all| all.get(var)) else {
+                continue;
+            };
+            with([gradient], |[gradient]| {
+                let pairs = sum.iter_mut().zip(gradient);
+                pairs.for_each(|(sum, g)| *sum += share * g);
+            })?;
         }
     }
     Ok((value, sums))

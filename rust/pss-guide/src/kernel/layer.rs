@@ -100,7 +100,10 @@ impl Linear {
         leaky: bool,
     ) {
         let n = input.len();
-        let weights = &self.weights[first * n..][..G * n];
+        let mut weights = [&self.weights[..0]; G];
+        for g in 0..G {
+            weights[g] = &self.weights[(first + g) * n..][..n];
+        }
         let mut sums = [[[simd.splat_f32s(0.0); V]; TILE]; G];
         for g in 0..G {
             for t in 0..TILE {
@@ -111,7 +114,7 @@ impl Linear {
             let x = input[i].vectors::<S, V>();
             for g in 0..G {
                 for t in 0..TILE {
-                    let w = simd.splat_f32s(weights[g * n + i][t]);
+                    let w = simd.splat_f32s(weights[g][i][t]);
                     for v in 0..V {
                         sums[g][t][v] = simd.mul_add_e_f32s(w, x[v], sums[g][t][v]);
                     }
