@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from pathlib import Path
 
 import pytest
 
+from pssflow.study import scaling
 from pssflow.study.bench import bench
 from pssflow.study.bench_guides import GUIDES, kernels
 from pssflow.study.coverage import KINDS, coverage, document
@@ -100,6 +102,32 @@ def test_bench(llvm_variant, tmp_path, monkeypatch, capfd):
     assert "there is no scene 'nowhere'" in capfd.readouterr().err
     with pytest.raises(RuntimeError, match="cannot be run"):
         kernels(str(tmp_path / "missing"), 1, print)
+
+
+def test_scaling(tmp_path, capfd):
+    """A row for each value of an axis and a chart; what grows too fast is said, what does not is not."""
+    arguments = ["-o", str(tmp_path), "--axes", "emitters,spp", "--most", "4", "--rounds", "1"]
+    assert run_command(scaling.scaling, arguments) == 0, capfd.readouterr().err
+    with (tmp_path / "scaling.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["axis"], row["value"]) for row in rows] == [
+        ("emitters", "1"), ("spp", "1"), ("spp", "4"),
+    ]  # fmt: skip
+    assert all(float(row["us_per_path"]) > 0 and float(row["held_mib"]) > 0 for row in rows)
+    assert (tmp_path / "scaling.png").stat().st_size > 10_000
+
+    def row(axis, value, **numbers):
+        row = {"axis": axis, "value": value, "us_per_path": 1.0, "over_rays": 2.0, "render_s": 1.0}
+        return row | numbers
+
+    rows = [
+        row("emitters", 1),
+        row("emitters", 10, over_rays=2.5),
+        row("emitters", 100, over_rays=3),
+    ]
+    assert [text.split(":")[0] for text in scaling.judge("emitters", rows)] == ["emitters = 100"]
+    rows = [row("spp", 1, us_per_path=0.1, render_s=1e-3), row("spp", 4), row("spp", 16)]
+    assert scaling.judge("spp", rows) == []
 
 
 def test_coverage(llvm_variant, tmp_path, monkeypatch, capfd):

@@ -1,8 +1,8 @@
 """What everything costs: `make bench` writes out/bench.json and prints it as tables.
 
-Scenes: paths per second beside the rays alone and beside Mitsuba (`contest`). Guides: their kernels, beside candle and the
-most that a core multiplies (the Rust program `guide_cost`), what each adds to a path, and the cost ratio that `auto` takes
-for it under `--spp`. Everything takes turns; medians are told, with the load of the machine.
+Scenes: paths per second beside the rays alone and beside Mitsuba (`contest`). Guides: their kernels, beside candle and
+the most that a core multiplies (the Rust program `guide_cost`), what each adds to a path, and the cost ratio that
+`auto` takes for it under `--spp`. Everything takes turns; medians are told, with the load of the machine.
 """
 
 from __future__ import annotations
@@ -122,9 +122,9 @@ def bench(
     after = os.getloadavg()
     record["machine"]["load_average"] = {"before": before, "after": after}
     console.print(
-        f"load average {after[0]:.2f} (1 min) at the end\n“rays” are sent to Embree per path; for Mitsuba an upper bound "
-        f"(shadow rays towards emitters that face away are not sent). Mitsuba's path of depth {k + 1} gathers the light "
-        f"of up to {k} bounces, ours that of exactly {k}: compare µs per ray.",
+        f"load average {after[0]:.2f} (1 min) at the end\n“rays” are sent to Embree per path; for Mitsuba an upper "
+        "bound (shadow rays towards emitters that face away are not sent). Mitsuba's path of depth "
+        f"{k + 1} gathers the light of up to {k} bounces, ours that of exactly {k}: compare Mrays/s.",
         highlight=False,
     )
     write_json(target, record)
@@ -177,9 +177,7 @@ def scaling(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     times = {(row["contestant"], row["threads"]): row["seconds"] for row in rows}
     one, two = THREADS
     return {
-        name: statistics.median(
-            a / b for a, b in zip(seconds, times[name, two], strict=True)
-        )
+        name: statistics.median(a / b for a, b in zip(seconds, times[name, two], strict=True))
         for (name, threads), seconds in times.items()
         if threads == one
     }
