@@ -116,15 +116,12 @@ def test_scaling(tmp_path, capfd):
     assert all(float(row["us_per_path"]) > 0 and float(row["held_mib"]) > 0 for row in rows)
     assert (tmp_path / "scaling.png").stat().st_size > 10_000
 
-    def row(axis, value, **numbers):
-        row = {"axis": axis, "value": value, "us_per_path": 1.0, "over_rays": 2.0, "render_s": 1.0}
-        return row | numbers
+    def row(axis, value, us_per_path=1.0, over_rays=2.0, render_s=1.0):
+        row = {"axis": axis, "value": value, "render_s": render_s}
+        return row | {"us_per_path": us_per_path, "over_rays": over_rays}
 
-    rows = [
-        row("emitters", 1),
-        row("emitters", 10, over_rays=2.5),
-        row("emitters", 100, over_rays=3),
-    ]
+    rows = [row("emitters", 1), row("emitters", 10, over_rays=2.5)]
+    rows.append(row("emitters", 100, over_rays=3.0))
     assert [text.split(":")[0] for text in scaling.judge("emitters", rows)] == ["emitters = 100"]
     rows = [row("spp", 1, us_per_path=0.1, render_s=1e-3), row("spp", 4), row("spp", 16)]
     assert scaling.judge("spp", rows) == []

@@ -20,6 +20,7 @@
 mod kernel;
 mod ops;
 pub(crate) mod options;
+mod plain;
 #[cfg(test)]
 mod tests;
 mod train;

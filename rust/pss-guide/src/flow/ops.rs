@@ -15,7 +15,7 @@ use crate::kernel::layer::SLOPE;
 use crate::kernel::product::{Strided, multiply};
 
 /// ln q given to a row outside the hypercube prior's support, where q = 0: about ln of the smallest f32.
-const LN_ZERO: f64 = -87.0;
+pub(super) const LN_ZERO: f64 = -87.0;
 
 fn floats<'a>(storage: &'a CpuStorage, layout: &Layout) -> Result<&'a [f32]> {
     let (start, end) = layout

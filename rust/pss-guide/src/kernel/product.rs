@@ -78,6 +78,7 @@ impl Product<'_, '_> {
     #[inline(always)]
     #[allow(
         clippy::needless_range_loop,
+        clippy::manual_memcpy,
         reason = "indices are inlined wherever this is compiled, iterators only where the compiler likes"
     )]
     fn panel<S: Simd, const R: usize, const V: usize>(
