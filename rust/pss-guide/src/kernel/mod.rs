@@ -61,12 +61,14 @@ impl Isa {
     /// changes nothing here: Embree's device refuses it with a message.
     fn chosen() -> Self {
         static CHOSEN: OnceLock<Isa> = OnceLock::new();
-        *CHOSEN.get_or_init(|| {
-            let supported = Self::supported();
-            let wanted = std::env::var("PSSFLOW_ISA").unwrap_or_default();
-            let named = supported.iter().find(|isa| isa.name() == wanted);
-            *named.or(supported.last()).unwrap_or(&Self::Portable)
-        })
+        *CHOSEN.get_or_init(|| Self::named(&std::env::var("PSSFLOW_ISA").unwrap_or_default()))
+    }
+
+    /// What has this name, else the best that is supported.
+    fn named(name: &str) -> Self {
+        let supported = Self::supported();
+        let named = supported.iter().find(|isa| isa.name() == name);
+        *named.or(supported.last()).unwrap_or(&Self::Portable)
     }
 
     /// Runs `op` compiled for these instructions; portable code where the processor lacks them.
@@ -102,4 +104,21 @@ pub(crate) fn dispatch<O: WithSimd>(op: O) -> O::Output {
 /// without vectors of its own.
 pub fn isa() -> &'static str {
     Isa::chosen().name()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_name_chooses_its_instructions_and_any_other_the_best() {
+        let supported = Isa::supported();
+        for &isa in &supported {
+            assert_eq!(Isa::named(isa.name()), isa);
+        }
+        for name in ["", "avx3"] {
+            assert_eq!(Some(&Isa::named(name)), supported.last());
+        }
+        assert!(supported.iter().any(|isa| isa.name() == self::isa()));
+    }
 }

@@ -31,7 +31,7 @@ use crate::predict::HeldOut;
 use crate::records::Clipped;
 use crate::{Context, Decision, Fit, Guide, GuideError, Records};
 
-/// Seconds on one core that a decision, forward and back, takes with the default network, as `examples/guide_cost.rs` shows.
+/// Seconds on one core that a decision, forward and back, takes with the default network, as `examples/guide_cost` shows.
 const SECONDS_PER_DECISION: f64 = 1.4e-6;
 
 /// Multiplications of the default `mixture-net`.
