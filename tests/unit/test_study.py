@@ -102,6 +102,8 @@ def test_bench(llvm_variant, tmp_path, monkeypatch, capfd):
     assert "there is no scene 'nowhere'" in capfd.readouterr().err
     with pytest.raises(RuntimeError, match="cannot be run"):
         kernels(str(tmp_path / "missing"), 1, print)
+    with pytest.raises(RuntimeError, match="wrote no figures"):
+        kernels("true", 1, print)
 
 
 def test_scaling(tmp_path, capfd):

@@ -24,6 +24,7 @@ import mitsuba as mi
 from rich.table import Table
 
 from .. import _core
+from ..guide import aliases
 from ..output import make_folder, write_json
 from ..scene import Scene
 from ..terminal import Terminal, run_command
@@ -220,15 +221,10 @@ def _add_scene(
 
 def _add_table(guides: dict[str, Any]) -> None:
     """What `auto` takes for `table`: the sum over its parts."""
-    parts = [guides[name].get("cost_ratio_of_the_registry") for name in _table_parts()]
+    names = aliases()["table"].split("+")
+    parts = [guides[name].get("cost_ratio_of_the_registry") for name in names]
     if all(part is not None for part in parts):
         guides["table"]["cost_ratio_of_the_registry"] = sum(parts)
-
-
-def _table_parts() -> list[str]:
-    from ..guide import aliases
-
-    return aliases()["table"].split("+")
 
 
 def _said(ratios: Mapping[str, Mapping[str, float]]) -> str:

@@ -61,6 +61,8 @@ def kernels(program: str, rows: int, say: Callable[[str], None]) -> dict[str, An
         except subprocess.CalledProcessError as error:
             lines = error.stderr.strip().splitlines() or ["no word"]
             raise RuntimeError(f"{program} failed: {lines[-1]}") from None
+        if not found.is_file():
+            raise RuntimeError(f"{program} wrote no figures; it is another program, or an old one")
         return json.loads(found.read_text(encoding="utf-8"))
 
 

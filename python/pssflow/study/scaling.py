@@ -98,14 +98,15 @@ def scaling(
         raise ValueError(f"there is no axis {unknown[0]!r}; there are {', '.join(AXES)}")
     folder = make_folder(output)
     rows: list[dict[str, Any]] = []
+    path = folder / "scaling.csv"
     for axis in axes.split(","):
         field, values = AXES[axis]
         for value in values or threads():
             if value <= most:
                 terminal.say(f"{axis}: {value}")
                 rows.append({"axis": axis, "value": value} | _in_a_process({field: value}, rounds))
-    path = folder / "scaling.csv"
-    write_beside(path, lambda part: _write(part, rows))
+                # After each point, so that an interrupted run leaves a table, too.
+                write_beside(path, lambda part: _write(part, rows))
     findings = [text for axis in axes.split(",") for text in judge(axis, rows)]
     draw(folder / "scaling", rows, axes.split(","), findings)
     for text in findings or ["nothing grows faster than it should"]:
