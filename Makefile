@@ -81,8 +81,13 @@ lint: build $(VENV)/.lint ## rustfmt, clippy, ruff, pyright
 	$(BIN)/basedpyright
 
 .PHONY: bench
-bench: build ## paths per second beside the rays alone and beside Mitsuba
-	$(BIN)/python -m pssflow.study.bench
+bench: build ## what paths, guides and training cost, beside Mitsuba and candle: out/bench.json, 20 minutes
+	cargo build --release -p pss-guide --example guide_cost
+	$(BIN)/python -m pssflow.study.bench --kernels target/release/examples/guide_cost
+
+.PHONY: study-scaling
+study-scaling: build ## time and memory against spp, pixels, k, triangles, emitters, threads: out/study-scaling, 10 minutes
+	$(BIN)/python -m pssflow.study.scaling -o out/study-scaling
 
 .PHONY: coverage
 coverage: build ## every scene beside Mitsuba, by mean and by speed: docs/coverage.md

@@ -52,6 +52,7 @@ def test_make_help_lists_every_target() -> None:
             "test-long",
             "lint",
             "bench",
+            "study-scaling",
             "coverage",
             "study-guides",
             "study-speed-accuracy",

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from pathlib import Path
 
 import pytest
 
+from pssflow.study import scaling
 from pssflow.study.bench import bench
+from pssflow.study.bench_guides import GUIDES, kernels
 from pssflow.study.coverage import KINDS, coverage, document
 from pssflow.study.demo import METHODS, THESIS, demo
 from pssflow.terminal import run_command
@@ -48,25 +51,82 @@ def test_demo(cache, llvm_variant, tmp_path, capfd):
     assert (folder / "reference.exr").exists()
 
 
-def test_bench(llvm_variant, tmp_path, capfd):
-    arguments = ["-o", tmp_path, "--scenes", ROOT / "scenes", "--scale", "0.125", "--spp", "1"]
-    assert run_command(bench, [str(a) for a in [*arguments, "--rounds", "1"]]) == 0
+def test_bench(llvm_variant, tmp_path, monkeypatch, capfd):
+    """Every key of the record and every table, the kernels' part from a program that writes what `guide_cost` does."""
+    monkeypatch.chdir(ROOT)
+    fused = {"sample_us": 0.5, "sample_share_of_peak": 0.75, "cost_ratio_of_the_registry": 0.25}
+    told = {
+        "peak": {"gflops_per_core": 100.0, "instructions": "avx2"},
+        "guides": dict.fromkeys(GUIDES, fused),
+        "training": {
+            "rows": 2000,
+            "realnvp": {"1": 2.0, "1_processor": None, "2": 1.0, "scaling": 2.0},
+        },
+    }
+    program = tmp_path / "guide_cost"
+    program.write_text(f"#!/bin/sh\ncat > $2 <<'END'\n{json.dumps(told)}\nEND\n")
+    program.chmod(0o755)
+    arguments = ["-o", tmp_path, "--scenes", "scenes/cornell-box", "--side", "32", "--spp", "1"]
+    arguments += ["--rounds", "1", "--kernels", program, "--rows", "2000"]
+    assert run_command(bench, [str(a) for a in arguments]) == 0, capfd.readouterr().err
     out, _ = capfd.readouterr()
-    assert "load average" in out
+    for text in ("load average", "× the time of its rays", "avx2", "75%", "2.000"):
+        assert text in out
     record = json.loads((tmp_path / "bench.json").read_text())
-    for scene in ("cornell-box", "teapot"):
-        for threads in (1, 2):
-            rows = {
-                row["contestant"]: row
-                for row in record["rows"]
-                if (row["scene"], row["threads"]) == (scene, threads)
-            }
-            assert rows.keys() == {
-                "pssflow, mis", "pssflow, nee", "mis, its rays alone", "Mitsuba scalar_rgb", "Mitsuba llvm_ad_rgb",
-            }  # fmt: skip
-            assert all(row["paths_per_second"] > 0 for row in rows.values())
-            # A path of k = 2 has at most three rays to surfaces and two to emitters.
-            assert all(1 <= row["rays_per_path"] <= 5 for row in rows.values())
+    keys = "machine peak rays mitsuba scenes guides training"
+    assert record.keys() >= set(keys.split())
+    assert record["guides"].keys() == set(GUIDES)
+    assert record["peak"] == told["peak"]
+    assert record["training"] == told["training"]
+    for name in ("realnvp", "direction-table", "mixture-net"):
+        row = record["guides"][name]
+        assert row["sample_us"] == 0.5
+        assert row["added"]["share"] > -1
+    # The direction's, the emitter's, the light's and the ray's table.
+    assert record["guides"]["table"]["cost_ratio_of_the_registry"] == 4 * 0.25
+    scene = record["scenes"]["scenes/cornell-box"]
+    for threads in ("1", "2"):
+        rows = {name: row for name, row in scene[threads].items() if name != "ratios"}
+        assert rows.keys() == {
+            "pssflow, mis", "pssflow, nee", "mis, its rays alone", "Mitsuba scalar_rgb", "Mitsuba llvm_ad_rgb",
+        }  # fmt: skip
+        assert all(row["paths_per_second"] > 0 for row in rows.values())
+        # A path of k = 2 has at most three rays to surfaces and two to emitters.
+        assert all(1 <= row["rays_per_path"] <= 5 for row in rows.values())
+        ours, alone = rows["pssflow, mis"]["seconds"], rows["mis, its rays alone"]["seconds"]
+        assert scene[threads]["ratios"]["over_rays"] == pytest.approx(ours[0] / alone[0])
+        assert record["rays"]["scenes/cornell-box"][threads] == rows["mis, its rays alone"]
+    assert set(record["mitsuba"]) == {"scalar_rgb", "llvm_ad_rgb"}
+
+    assert run_command(bench, ["--scenes", "nowhere", "-o", str(tmp_path)]) == 2
+    assert "there is no scene 'nowhere'" in capfd.readouterr().err
+    with pytest.raises(RuntimeError, match="cannot be run"):
+        kernels(str(tmp_path / "missing"), 1, print)
+    with pytest.raises(RuntimeError, match="wrote no figures"):
+        kernels("true", 1, print)
+
+
+def test_scaling(tmp_path, capfd):
+    """A row for each value of an axis and a chart; what grows too fast is said, what does not is not."""
+    arguments = ["-o", str(tmp_path), "--axes", "emitters,spp", "--most", "4", "--rounds", "1"]
+    assert run_command(scaling.scaling, arguments) == 0, capfd.readouterr().err
+    with (tmp_path / "scaling.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["axis"], row["value"]) for row in rows] == [
+        ("emitters", "1"), ("spp", "1"), ("spp", "4"),
+    ]  # fmt: skip
+    assert all(float(row["us_per_path"]) > 0 and float(row["held_mib"]) > 0 for row in rows)
+    assert (tmp_path / "scaling.png").stat().st_size > 10_000
+
+    def row(axis, value, us_per_path=1.0, over_rays=2.0, render_s=1.0):
+        row = {"axis": axis, "value": value, "render_s": render_s}
+        return row | {"us_per_path": us_per_path, "over_rays": over_rays}
+
+    rows = [row("emitters", 1), row("emitters", 10, over_rays=2.5)]
+    rows.append(row("emitters", 100, over_rays=3.0))
+    assert [text.split(":")[0] for text in scaling.judge("emitters", rows)] == ["emitters = 100"]
+    rows = [row("spp", 1, us_per_path=0.1, render_s=1e-3), row("spp", 4), row("spp", 16)]
+    assert scaling.judge("spp", rows) == []
 
 
 def test_coverage(llvm_variant, tmp_path, monkeypatch, capfd):

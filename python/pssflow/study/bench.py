@@ -1,25 +1,20 @@
-"""Paths per second of the tracer, beside its rays alone and beside Mitsuba's `path`: `make bench`.
+"""What everything costs: `make bench` writes out/bench.json and prints it as tables.
 
-All contestants take turns within a round, so that a busy machine slows all of them; medians over the rounds are
-reported. Each is run once before, unmeasured: Mitsuba's LLVM variant compiles its kernel then.
-
-Rays per path. Ours are counted by the tracer (for `nee` less the BSDF rays of `mis`). Mitsuba does not count: at
-depth k+1 its `path` sends up to k+1 rays to find surfaces and up to k shadow rays, fewer where a path escapes. The
-shares of paths that reach x₁ … x_k are those of our own uniform paths, drawn from the same BSDFs; shadow rays are an
-upper bound, since none is sent to an emitter that faces away. A path of Mitsuba also gathers the light of fewer
-bounces, ours that of exactly k: rays per second are comparable, paths per second only with the rays beside them.
+Scenes: paths per second beside the rays alone and beside Mitsuba (`contest`). Guides: their kernels, beside candle and
+the most that a core multiplies (the Rust program `guide_cost`), what each adds to a path, and the cost ratio that
+`auto` takes for it under `--spp`. Everything takes turns; medians are told, with the load of the machine.
 """
 
 from __future__ import annotations
 
-import functools
+import math
 import os
 import platform
+import re
 import statistics
 import sys
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,196 +23,229 @@ import drjit as dr
 import mitsuba as mi
 from rich.table import Table
 
+from .. import _core
+from ..guide import aliases
 from ..output import make_folder, write_json
 from ..scene import Scene
 from ..terminal import Terminal, run_command
 from ..variants import llvm_problem
+from . import parity
+from .bench_guides import GUIDES, added, kernels, peers
+from .contest import LLVM, OURS, RAYS_ALONE, SCALAR, contestants, film_scale, loader, measure
 
-SCENES = ("cornell-box", "teapot")
-SCALAR, LLVM = "scalar_rgb", "llvm_ad_rgb"
-RAYS_ALONE = "mis, its rays alone"
-
+THREADS = (1, 2)
 
 SIGNS = {"counted": "", "about": "≈ ", "upper bound": "≤ "}
 """What stands before rays per path that are not counted."""
 
 
-@dataclass
-class Contestant:
-    """Something that traces `paths` paths when it is called."""
-
-    name: str
-    run: Callable[[], object]
-    paths: int
-    rays_per_path: float
-    counted: str
-    """How well `rays_per_path` is known: a key of `SIGNS`."""
-
-
 @click.command("bench")
 @click.option("-o", "--output", default="out", show_default=True, help="Folder for bench.json.")
-@click.option("--scenes", "folder", default="scenes", show_default=True, help="Folder of scenes.")
-@click.option(
-    "--spp", default=16, show_default=True, type=click.IntRange(1), help="Samples a pixel."
-)
+@click.option("--scenes", help="Names, by commas.  [default: two of our own, all third-party ones]")
+@click.option("--guided", default="scenes/cornell-box", show_default=True, help="Where guides are.")
+@click.option("--spp", default=16, show_default=True, type=click.IntRange(1))
 @click.option("--rounds", default=5, show_default=True, type=click.IntRange(1))
-@click.option("--scale", default=1.0, show_default=True, help="Factor on the film's size.")
+@click.option("--side", default=256, show_default=True, help="Longer side of films, in pixels.")
 @click.option("-k", "--bounces", "k", default=2, show_default=True, type=click.IntRange(1, 32))
+@click.option("--kernels", "program", help="The built program guide_cost; without it no kernels.")
+@click.option("--rows", default=100_000, show_default=True, help="Paths of a training epoch.")
 @click.pass_obj
 def bench(
-    terminal: Terminal, output: str, folder: str, spp: int, rounds: int, scale: float, k: int
+    terminal: Terminal,
+    output: str,
+    scenes: str | None,
+    guided: str,
+    spp: int,
+    rounds: int,
+    side: int,
+    k: int,
+    program: str | None,
+    rows: int,
 ) -> None:
-    """Measures paths per second; writes bench.json."""
+    """Measures what paths and guides cost; writes bench.json."""
     console = terminal.out
     target = make_folder(output) / "bench.json"
+    plans = {plan.name: plan for plan in parity.all_plans()}
+    names = scenes.split(",") if scenes else usual_scenes(plans)
+    for name in [*names, guided]:
+        if name not in plans:
+            raise ValueError(f"there is no scene {name!r}; there are {', '.join(plans)}")
     before = os.getloadavg()
     console.print(
-        f"{platform.machine()}, {os.cpu_count()} cores, load average {before[0]:.2f} "
-        f"(1 min) before the start; {spp} spp, k = {k}, medians of {rounds} interleaved rounds, "
-        "warm-up and compilation not measured"
+        f"{processor()}, {os.cpu_count()} cores, load average {before[0]:.2f} (1 min) before the "
+        f"start; {spp} spp, k = {k}, films of {side} pixels, medians of {rounds} interleaved "
+        "rounds, warm-up and compilation not measured"
     )
     problem = llvm_problem()
     if problem:
         console.print(f"without {LLVM}: {problem}")
-    rows = []
+    record: dict[str, Any] = {
+        "machine": {
+            "processor": processor(),
+            "architecture": platform.machine(),
+            "cores": os.cpu_count(),
+            "pssflow": _core.__version__,
+            "mitsuba": mi.__version__,
+        },
+        "settings": {"spp": spp, "k": k, "side": side, "rounds": rounds},
+        "peak": None,
+        "rays": {},
+        "mitsuba": {SCALAR: {}, LLVM: {}},
+        "scenes": {},
+        "guides": {name: {} for name in GUIDES},
+        "training": None,
+    }
     thread_count = dr.thread_count()
     try:
-        for name in SCENES:
-            path = Path(folder) / name / "scene.xml"
-            load = loader(path, scale)
-            contests = {n: contestants(load, spp, k, n) for n in (1, 2)}
-            measured = measure(contests, rounds)
-            rows += [row | {"scene": name} for row in measured]
-            console.print(table(name, measured))
+        for name in names:
+            _add_scene(record, name, plans[name], spp, k, rounds, side, console)
+        mi.set_variant(SCALAR)
+        path = plans[guided].path
+        scene = Scene(path, scale=film_scale(path, side))
     finally:
         dr.set_thread_count(thread_count)
+    record["geometric_means"] = means = geometric_means(record["scenes"])
+    console.print(_said(means))
+    costs = kernels(program, rows, terminal.say) if program else {}
+    record["peak"], record["training"] = costs.get("peak"), costs.get("training")
+    for name, cost in added(scene, k, spp, rounds).items():
+        fused = costs.get("guides", {}).get(name, {})
+        record["guides"][name] = fused | {"added": cost | {"scene": guided}}
+    _add_table(record["guides"])
+    console.print(guide_table(record["guides"], guided, record["peak"]))
+    if record["training"]:
+        console.print(training_table(record["training"]))
+    else:
+        console.print("without kernels and training: --kernels names no program")
+    record["peers"] = peers()
+    for name, micros in record["peers"].items():
+        console.print(f"{name}: {micros:.2f} µs per sample of 5 numbers", highlight=False)
     after = os.getloadavg()
-    console.print(f"load average {after[0]:.2f} (1 min) at the end")
+    record["machine"]["load_average"] = {"before": before, "after": after}
     console.print(
-        f"“rays” are sent to Embree per path; for Mitsuba an upper bound (shadow rays towards emitters that face "
-        f"away are not sent). Mitsuba's path of depth {k + 1} gathers the light of up to {k} bounces, "
-        f"ours that of exactly {k}: compare µs per ray.",
-        style="dim",
+        f"load average {after[0]:.2f} (1 min) at the end\n“rays” are sent to Embree per path; for Mitsuba an upper "
+        "bound (shadow rays towards emitters that face away are not sent). Mitsuba's path of depth "
+        f"{k + 1} gathers the light of up to {k} bounces, ours that of exactly {k}: compare Mrays/s.",
         highlight=False,
     )
-    write_json(
-        target,
-        {
-            "machine": platform.machine(),
-            "cores": os.cpu_count(),
-            "load_average": {"before": before, "after": after},
-            "spp": spp,
-            "k": k,
-            "rounds": rounds,
-            "rows": rows,
-        },
-    )
+    write_json(target, record)
     console.print(f"wrote {target}")
 
 
-Loader = Callable[[str], Scene]
-"""Gives the scene in a variant of Mitsuba, which it sets."""
+def usual_scenes(plans: Mapping[str, parity.Plan]) -> list[str]:
+    """Two of our own, and the third-party ones that are there, each by its first camera."""
+    own = ["scenes/cornell-box", "scenes/teapot"]
+    return own + [name for name in plans if "/" not in name and "_cam" not in name]
 
 
-def loader(path: Path, scale: float) -> Loader:
-    """Loads a scene once for each variant."""
-
-    @functools.cache
-    def load(variant: str) -> Scene:
-        mi.set_variant(variant)
-        return Scene(path, scale=scale)
-
-    return load
+def processor() -> str:
+    """The processor's name, where the system tells it."""
+    try:
+        found = re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.M)
+    except OSError:
+        found = None
+    return found[1] if found else platform.processor() or platform.machine()
 
 
-def contestants(
-    load: Loader,
-    spp: int,
-    k: int,
-    threads: int,
-    *,
-    strategies: Sequence[str] = ("mis", "nee"),
-    variants: Sequence[str] = (SCALAR, LLVM),
-) -> list[Contestant]:
-    """All that take turns on one scene: ours with each strategy, its rays alone, Mitsuba in each variant."""
-    scene = load(SCALAR)
-    paths = scene.width * scene.height * spp
-    alone = scene.core.rays_alone(spp=1, k=k, threads=threads)
-    reach = [_reached(scene, bounces) for bounces in range(1, k + 1)]
-    found = [
-        Contestant(
-            f"pssflow, {strategy}",
-            lambda strategy=strategy: scene.render(
-                "none",
-                spp,
-                k=k,
-                emitter_strategy=strategy,
-                threads=threads,
-                progress=False,
-            ),
-            paths,
-            # `rays_alone` sends those of MIS; NEE spares the ray from x_k that looks for an emitter.
-            alone["rays_per_path"] - (reach[-1] if strategy == "nee" else 0.0),
-            "counted" if strategy == "mis" else "about",
-        )
-        for strategy in strategies
-    ]
-    found.append(
-        Contestant(
-            RAYS_ALONE,
-            lambda: scene.core.rays_alone(spp=spp, k=k, threads=threads),
-            paths,
-            alone["rays_per_path"],
-            "counted",
-        )
-    )
-    bound = 1 + 2 * sum(reach)
-    for variant in variants:
-        if variant == LLVM and llvm_problem():
-            continue
-        run = _mitsuba(load, variant, spp, k, threads)
-        found.append(Contestant(f"Mitsuba {variant}", run, paths, bound, "upper bound"))
+def ratios(rows: Sequence[Mapping[str, Any]], threads: int) -> dict[str, float]:
+    """A scene's time in its rays', and Mitsuba's in ours: medians of the rounds' ratios."""
+    times = {row["contestant"]: row["seconds"] for row in rows if row["threads"] == threads}
+
+    def ratio(above: str, below: str) -> float:
+        return statistics.median(a / b for a, b in zip(times[above], times[below], strict=True))
+
+    found = {"over_rays": ratio(OURS, RAYS_ALONE)}
+    for variant in (SCALAR, LLVM):
+        if f"Mitsuba {variant}" in times:
+            found[f"{variant}_over_ours"] = ratio(f"Mitsuba {variant}", OURS)
     return found
 
 
-def measure(contests: dict[int, list[Contestant]], rounds: int) -> list[dict[str, Any]]:
-    """Runs all in turn; one row for each contestant and number of threads."""
-    seconds: dict[tuple[int, str], list[float]] = {}
-    for measured in range(-1, rounds):
-        for threads, group in contests.items():
-            for contestant in group:
-                start = time.perf_counter()
-                result = contestant.run()
-                elapsed = time.perf_counter() - start
-                if isinstance(result, dict):  # it left its preparations out of the time
-                    elapsed = result["seconds"]
-                if measured >= 0:
-                    seconds.setdefault((threads, contestant.name), []).append(elapsed)
-    rows = []
-    for threads, group in contests.items():
-        for contestant in group:
-            times = seconds[threads, contestant.name]
-            median = statistics.median(times)
-            rows.append(
-                {
-                    "contestant": contestant.name,
-                    "threads": threads,
-                    "paths_per_second": contestant.paths / median,
-                    "us_per_path": 1e6 * median / contestant.paths,
-                    "rays_per_path": contestant.rays_per_path,
-                    "rays": contestant.counted,
-                    "mrays_per_second": contestant.rays_per_path * contestant.paths / median / 1e6,
-                    "seconds": times,
-                }
-            )
-    return rows
+def geometric_means(scenes: Mapping[str, Any]) -> dict[str, dict[str, float]]:
+    """Of every ratio over all scenes that have it, by number of threads."""
+    means: dict[str, dict[str, float]] = {}
+    for threads in map(str, THREADS):
+        told = [scene[threads]["ratios"] for scene in scenes.values()]
+        for name in {name for ratios in told for name in ratios}:
+            values = [ratios[name] for ratios in told if name in ratios]
+            mean = math.exp(statistics.fmean(map(math.log, values)))
+            means.setdefault(threads, {})[name] = mean
+    return means
 
 
-def table(name: str, rows: list[dict[str, Any]]) -> Table:
+def scaling(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """How much faster each contestant is on two threads than on one: medians of the rounds' ratios."""
+    times = {(row["contestant"], row["threads"]): row["seconds"] for row in rows}
+    one, two = THREADS
+    return {
+        name: statistics.median(a / b for a, b in zip(seconds, times[name, two], strict=True))
+        for (name, threads), seconds in times.items()
+        if threads == one
+    }
+
+
+def _add_scene(
+    record: dict[str, Any],
+    name: str,
+    plan: parity.Plan,
+    spp: int,
+    k: int,
+    rounds: int,
+    side: int,
+    console: Any,
+) -> None:
+    """Measures a scene, prints its table and files its rows."""
+    start = time.perf_counter()
+    mi.set_variant(SCALAR)
+    load = loader(plan.path, film_scale(plan.path, side))
+    variants = [SCALAR, LLVM] if plan.variant == LLVM else [SCALAR]
+    contests = {n: contestants(load, spp, k, n, variants=variants) for n in THREADS}
+    rows = measure(contests, rounds)
+    told: dict[str, Any] = {"scaling": scaling(rows)}
+    for threads in THREADS:
+        mine = [row for row in rows if row["threads"] == threads]
+        told[str(threads)] = {"ratios": ratios(mine, threads)}
+        for row in mine:
+            numbers = {key: row[key] for key in row if key not in ("contestant", "threads")}
+            told[str(threads)][row["contestant"]] = numbers
+            if row["contestant"] == RAYS_ALONE:
+                record["rays"].setdefault(name, {})[str(threads)] = numbers
+            for variant in variants:
+                if row["contestant"] == f"Mitsuba {variant}":
+                    record["mitsuba"][variant].setdefault(name, {})[str(threads)] = numbers
+    told["seconds"] = time.perf_counter() - start
+    record["scenes"][name] = told
+    console.print(scene_table(name, rows))
+    console.print(_said({n: told[n]["ratios"] for n in map(str, THREADS)}), highlight=False)
+
+
+def _add_table(guides: dict[str, Any]) -> None:
+    """What `auto` takes for `table`: the sum over its parts."""
+    names = aliases()["table"].split("+")
+    parts = [guides[name].get("cost_ratio_of_the_registry") for name in names]
+    if all(part is not None for part in parts):
+        guides["table"]["cost_ratio_of_the_registry"] = sum(parts)
+
+
+def _said(ratios: Mapping[str, Mapping[str, float]]) -> str:
+    """Ratios in words, a line for each number of threads."""
+    words = {
+        "over_rays": "{:.2f} × the time of its rays",
+        f"{SCALAR}_over_ours": f"{{:.2f}} × as fast as {SCALAR}",
+        f"{LLVM}_over_ours": f"{{:.2f}} × as fast as {LLVM}",
+    }
+    lines = []
+    for threads, told in ratios.items():
+        parts = [text.format(told[key]) for key, text in words.items() if key in told]
+        lines.append(f"{threads} thread{'s' * (threads != '1')}: {', '.join(parts)}")
+    return "\n".join(lines)
+
+
+def scene_table(name: str, rows: Sequence[Mapping[str, Any]]) -> Table:
     """One scene's rows."""
-    shown = Table(title=f"scenes/{name}", title_justify="left")
+    shown = Table(title=name, title_justify="left")
     shown.add_column("")
-    for heading in ("threads", "Mpaths/s", "µs/path", "rays/path", "µs/ray", "spread"):
+    for heading in ("threads", "Mpaths/s", "µs/path", "rays/path", "Mrays/s", "spread"):
         shown.add_column(heading, justify="right")
     for i, row in enumerate(rows):
         times = row["seconds"]
@@ -228,37 +256,56 @@ def table(name: str, rows: list[dict[str, Any]]) -> Table:
             f"{row['paths_per_second'] / 1e6:.2f}",
             f"{row['us_per_path']:.3f}",
             f"{SIGNS[row['rays']]}{row['rays_per_path']:.2f}",
-            f"{1 / row['mrays_per_second']:.3f}",
+            f"{row['mrays_per_second']:.1f}",
             f"±{50 * spread:.0f} %",
             end_section=i + 1 < len(rows) and rows[i + 1]["threads"] != row["threads"],
         )
     return shown
 
 
-def _reached(scene: Scene, bounces: int) -> float:
-    """Share of uniform paths that have the vertices x₁ … x_bounces."""
-    stats = scene.render("none", 4, k=bounces, emitter_strategy="nee", seed=1, progress=False).stats
-    return stats["paths_found"] / stats["camera_rays"]
+def guide_table(guides: Mapping[str, Any], scene: str, peak: Mapping[str, Any] | None) -> Table:
+    """What guides cost, in their kernels and in whole paths."""
+    title = f"guides; paths of {scene}, one thread"
+    if peak:
+        title += f"; {peak['instructions']}, a core's peak {peak['gflops_per_core']:.0f} GFLOP/s"
+    shown = Table(title=title, title_justify="left")
+    shown.add_column("")
+    for heading in (
+        *("sample [µs]", "density [µs]", "of the peak", "candle [µs]", "candle ÷ fused"),
+        *("added to a path [µs]", "as a share", "auto takes"),
+    ):
+        shown.add_column(heading, justify="right")
+    for name, row in guides.items():
+        cost = row.get("added") or {}
+        shown.add_row(
+            name,
+            _number(row.get("sample_us"), ".3f"),
+            _number(row.get("density_us"), ".3f"),
+            _number(row.get("sample_share_of_peak"), ".0%"),
+            _number(row.get("candle_sample_us"), ".2f"),
+            _number(row.get("candle_sample_over_fused"), ".1f"),
+            _number(cost.get("us"), ".3f"),
+            _number(cost.get("share"), ".0%"),
+            _number(row.get("cost_ratio_of_the_registry"), ".0%"),
+        )
+    return shown
 
 
-def _mitsuba(load: Loader, variant: str, spp: int, k: int, threads: int) -> Callable[[], object]:
-    """Mitsuba's `path` on the same film; the variant and the size of its thread pool are set before each run."""
-    loaded = load(variant)
-    scene = loaded.mi_scene
-    mi.set_variant(variant)
-    settings = {"max_depth": k + 1, "rr_depth": k + 2, "hide_emitters": loaded.hide_emitters}
-    integrator = mi.load_dict({"type": "path", **settings})
+def training_table(training: Mapping[str, Any]) -> Table:
+    """Seconds of an epoch."""
+    shown = Table(title=f"an epoch of {training['rows']} paths", title_justify="left")
+    shown.add_column("")
+    for heading in ("1 thread [s]", "its processor [s]", "2 threads [s]", "scaling"):
+        shown.add_column(heading, justify="right")
+    for name, row in training.items():
+        if name != "rows":
+            keys = ("1", "1_processor", "2", "scaling")
+            shown.add_row(name, *(_number(row[key], ".3f") for key in keys))
+    return shown
 
-    def run() -> dict[str, float]:
-        mi.set_variant(variant)
-        dr.set_thread_count(threads)
-        start = time.perf_counter()
-        image = integrator.render(scene, seed=0, spp=spp)
-        dr.eval(image)
-        dr.sync_thread()
-        return {"seconds": time.perf_counter() - start}
 
-    return run
+def _number(value: float | None, form: str) -> str:
+    return "" if value is None else format(value, form)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ from __future__ import annotations
 import json
 import os
 import platform
-import re
 import resource
 import subprocess
 import sys
@@ -33,7 +32,17 @@ from ..report import markdown_table
 from ..scene import Scene
 from ..terminal import Terminal, run_command
 from . import parity
-from .bench import LLVM, RAYS_ALONE, SCALAR, Contestant, contestants, loader, measure
+from .contest import (
+    LLVM,
+    OURS,
+    RAYS_ALONE,
+    SCALAR,
+    Contestant,
+    contestants,
+    film_scale,
+    loader,
+    measure,
+)
 from .parity import BOUNCES, SIDE, Plan
 from .store import commit
 from .welch import ALPHA, LUMINANCE
@@ -111,7 +120,7 @@ def examine(plan: Plan, effort: float, rounds: int, threads: int) -> dict[str, A
     """Everything about one scene."""
     idle = _peak()
     mi.set_variant(SCALAR)
-    timed = loader(plan.path, _scale(plan.path, TIMED_SIDE))
+    timed = loader(plan.path, film_scale(plan.path, TIMED_SIDE))
     first = timed(SCALAR)
     found: dict[str, Any] = {
         "timings": first.timings,
@@ -176,7 +185,7 @@ def features(scene: Scene) -> dict[str, dict[str, int]]:
 def speeds(contest: Sequence[Contestant], threads: int, rounds: int) -> dict[str, float]:
     """Paths per second by contestant, and ours in Mitsuba's: medians of the rounds, and of their ratios."""
     rows = {row["contestant"]: row for row in measure({threads: list(contest)}, rounds)}
-    ours = rows["pssflow, mis"]
+    ours = rows[OURS]
     found = {"ours": ours["paths_per_second"], "rays": rows[RAYS_ALONE]["paths_per_second"]}
     for variant in TARGETS:
         row = rows.get(f"Mitsuba {variant}")
@@ -197,17 +206,6 @@ def _reflected(scene: Scene) -> float:
         image = mi.render(scene.mi_scene, integrator=path, spp=LIGHT_SPP, seed=1)  # pyright: ignore[reportArgumentType]
         means.append(float(np.mean(np.array(image, np.float64)[..., :3] @ LUMINANCE)))
     return means[0] - means[1]
-
-
-def _scale(path: Path, side: int) -> float:
-    """Factor that gives a scene's film a longer side of `side` pixels."""
-    text = path.read_text(encoding="utf-8", errors="replace")
-    # Read without loading the scene a second time; a size by parameter needs Mitsuba.
-    sizes = re.findall(r'name="(?:width|height)"\s+value="(\d+)"', text)
-    if len(sizes) == 2:
-        return side / max(map(int, sizes))
-    film = mi.load_file(str(path), optimize=False).sensors()[0].film()
-    return side / max(int(n) for n in film.crop_size())
 
 
 def _peak() -> int:

@@ -11,13 +11,14 @@
 //!
 //! Start reading at [`Guide`]; a guide is made by [`fit`], which looks its name up in [`registry()`].
 //! All densities are with respect to the uniform measure on the cube. This crate knows no rays, no film
-//! and no Python, reads no environment variable and draws random numbers for training only: a sample is
+//! and no Python, reads no environment variable but `PSSFLOW_ISA` ([`isa`]), and draws random numbers for training only: a sample is
 //! made from the caller's uniform numbers, in place.
 
 mod composite;
 mod error;
 mod file;
 mod flow;
+mod kernel;
 mod net;
 mod normal;
 mod options;
@@ -36,6 +37,7 @@ use serde::{Deserialize, Serialize};
 pub use error::GuideError;
 pub use file::{Contents, FORMAT_VERSION, load, load_unchecked};
 pub use flow::options::{Prior, RealNvpOptions};
+pub use kernel::isa;
 pub use net::options::{MixtureNetOptions, NetOptions, SplineNetOptions};
 pub use options::Condition;
 pub use recipe::{ALIASES, Recipe};

@@ -17,10 +17,10 @@
 //! that 0 is no special case. Start reading at [`RealNvp`]; networks are evaluated by `kernel`, trained by
 //! `train` in candle.
 
-pub(crate) mod kernel;
+mod kernel;
 mod ops;
 pub(crate) mod options;
-pub(crate) mod product;
+mod plain;
 #[cfg(test)]
 mod tests;
 mod train;
@@ -35,6 +35,7 @@ use self::kernel::{Direction, Kernel};
 use self::options::{Prior, RealNvpOptions};
 use self::weights::{Shape, Weights};
 use crate::file::{self, Contents};
+use crate::kernel::math;
 use crate::{Context, Decision, Fit, Guide, GuideError, Records, normal, options as json_options};
 
 /// Base samples behind [`Guide::mass_outside`].
@@ -94,7 +95,7 @@ fn logit(u: f32) -> (f64, f64) {
 
 /// A film position as the networks see it, in [−1, 1]².
 fn film(pixel: &[f32; 2]) -> [f32; 2] {
-    pixel.map(|x| kernel::inside(2.0 * x - 1.0))
+    pixel.map(|x| math::inside(2.0 * x - 1.0))
 }
 
 /// A trained flow.

@@ -9,13 +9,13 @@ use candle_core::{
     CpuStorage, CustomOp1, CustomOp2, CustomOp3, Error, Layout, Result, Shape, Storage, Tensor,
 };
 
-use super::kernel::SLOPE;
 use super::options::Prior;
-use super::product::{Strided, multiply};
 use super::weights::kept;
+use crate::kernel::layer::SLOPE;
+use crate::kernel::product::{Strided, multiply};
 
 /// ln q given to a row outside the hypercube prior's support, where q = 0: about ln of the smallest f32.
-const LN_ZERO: f64 = -87.0;
+pub(super) const LN_ZERO: f64 = -87.0;
 
 fn floats<'a>(storage: &'a CpuStorage, layout: &Layout) -> Result<&'a [f32]> {
     let (start, end) = layout
@@ -25,7 +25,10 @@ fn floats<'a>(storage: &'a CpuStorage, layout: &Layout) -> Result<&'a [f32]> {
 }
 
 /// Runs `f` on the values of contiguous CPU tensors.
-fn with<const N: usize, R>(tensors: [&Tensor; N], f: impl FnOnce([&[f32]; N]) -> R) -> Result<R> {
+pub(super) fn with<const N: usize, R>(
+    tensors: [&Tensor; N],
+    f: impl FnOnce([&[f32]; N]) -> R,
+) -> Result<R> {
     let tensors = tensors.map(|t| t.contiguous());
     let mut owned = Vec::with_capacity(N);
     for t in tensors {

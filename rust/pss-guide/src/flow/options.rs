@@ -134,7 +134,7 @@ impl RealNvpOptions {
     }
 
     /// Seconds of training that each path given costs on one core, roughly: a step forward and back is six
-    /// operations a parameter and row, at the 32 GFLOP/s that `examples/guide_cost.rs` shows for this size.
+    /// operations a parameter and row, at the 32 GFLOP/s that `examples/guide_cost` shows for this size.
     /// 0 where the size of the training set is fixed by `samples`.
     pub(crate) fn seconds_per_path(&self, dims: usize) -> f64 {
         if self.samples.is_some() {

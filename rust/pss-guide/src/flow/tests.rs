@@ -1,6 +1,7 @@
 //! What holds for any weights; what holds after training is in `tests/guide`.
 #![allow(clippy::unwrap_used)]
 
+use candle_core::Device;
 use pss_rng::{Purpose, Sequence, Stream};
 use serde_json::json;
 
@@ -227,6 +228,40 @@ fn gradients_are_those_of_the_f64_twin() {
             live.contains(&seen),
             "{prior}, {condition:?}: {seen} gradients are not 0"
         );
+    }
+}
+
+/// Claim: the fused operations' loss and gradients are those of candle's own, to 1e-5 of the tensor's largest, for batches
+/// of several parts.
+#[test]
+fn fused_gradients_are_those_of_candles_operations() {
+    for (prior, condition, gain) in [
+        ("gaussian", "none", 1.5),
+        ("gaussian", "pixel", 1.0),
+        ("hypercube", "none", 0.2),
+    ] {
+        let given = json!({ "couplings": 3, "hidden": 13, "layers": 2, "prior": prior, "condition": condition });
+        let options = options(Domain::Logit, given);
+        let weights = weights(4, &options, gain);
+        let x = uniform(300, 4 + options.known(), 12);
+        let rows: Vec<u32> = (0..300).rev().collect();
+        let (loss, fused) = train::gradients(&options, &weights, &x, &rows).unwrap();
+        let cpu = Device::Cpu;
+        let (want, plain) = train::plain_gradients(&options, &weights, &x, &rows, &cpu).unwrap();
+        assert!(
+            (loss - want).abs() < 1e-5 * (1.0 + want.abs()),
+            "{loss} {want}"
+        );
+        for (tensor, (fused, plain)) in fused.iter().zip(&plain).enumerate() {
+            let largest = plain.iter().fold(0.0f32, |most, g| most.max(g.abs()));
+            for (a, b) in fused.iter().zip(plain) {
+                let error = (a - b).abs();
+                assert!(
+                    error <= 1e-5 * (largest + 1e-3),
+                    "{prior}, {condition}, tensor {tensor}: {a} {b}"
+                );
+            }
+        }
     }
 }
 

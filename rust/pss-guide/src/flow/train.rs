@@ -1,22 +1,31 @@
 //! Maximum likelihood by Adam (Kingma and Ba 2015, arXiv:1412.6980) on candle's graph.
 //!
 //! Weights live in plain vectors; each step builds the graph from fresh tensors of them, asks candle for
-//! the gradients and updates the vectors. A large batch goes through the graph in parts, because candle
-//! hands elementwise work on more than 65,536 numbers to a spinning thread pool, which collapses when
-//! other work wants the cores. So training stays on the caller's thread, and the same seed gives the same
-//! weights for any number of threads.
+//! the gradients and updates the vectors. A batch is cut into parts of fixed size, each with a graph of its own, that any
+//! number of rayon's threads may compute; their sums are added in order, so that the same seed gives the same weights for
+//! any number of threads. Parts are small enough that candle's own thread pool stays out: it takes elementwise work on more
+//! than 65,536 numbers, spins, and collapses when other work wants the cores.
+//!
+//! With the cargo feature `cuda` the graph is built on the first CUDA device that there is, a whole batch at once and of
+//! candle's own operations (`plain`). That was compiled and run nowhere so far but on the processor, where the tests compare
+//! the two graphs.
 
 use candle_core::{Device, Result as TensorResult, Tensor, Var};
 use pss_rng::{Purpose, Stream};
+use rayon::prelude::*;
 
 use super::Domain;
-use super::ops::{Affine, Condition, Linear, NegLogLikelihood};
+use super::ops::{Affine, Condition, Linear, NegLogLikelihood, with};
 use super::options::RealNvpOptions;
+use super::plain;
 use super::weights::Weights;
 use crate::{EpochLoss, GuideError};
 
 /// Most activations of a layer in one part of a batch.
-const PART: usize = 32_768;
+const ACTIVATIONS: usize = 32_768;
+
+/// Most rows of one part: half of the usual batch, for two threads. Each part costs a gradient of all weights.
+const PART: usize = 128;
 
 /// Weights after the last epoch, and the loss of each.
 pub(super) struct Trained {
@@ -46,6 +55,7 @@ pub(super) fn train(
         options,
         weights,
         x,
+        device: device(),
     };
     let mut history = Vec::with_capacity(options.epochs);
     for epoch in 0..options.epochs {
@@ -100,12 +110,27 @@ struct Trainer<'a> {
     weights: Weights,
     adam: Adam,
     x: &'a [f32],
+    device: Device,
+}
+
+/// Where training computes.
+fn device() -> Device {
+    #[cfg(feature = "cuda")]
+    if let Ok(device) = Device::new_cuda(0) {
+        return device;
+    }
+    Device::Cpu
 }
 
 impl Trainer<'_> {
     /// One step on the given rows; returns the loss before it. A loss that is not finite changes nothing.
     fn step(&mut self, rows: &[u32]) -> TensorResult<f64> {
-        let (loss, gradients) = gradients(self.options, &self.weights, self.x, rows)?;
+        let (options, weights) = (self.options, &self.weights);
+        let (loss, gradients) = if self.device.is_cpu() {
+            gradients(options, weights, self.x, rows)?
+        } else {
+            plain_gradients(options, weights, self.x, rows, &self.device)?
+        };
         if loss.is_finite() {
             self.adam.begin();
             for (index, gradient) in gradients.iter().enumerate() {
@@ -125,32 +150,76 @@ pub(super) fn gradients(
     rows: &[u32],
 ) -> TensorResult<(f64, Vec<Vec<f32>>)> {
     let shape = weights.shape;
-    let vars: Vec<Var> = shape
-        .tensors()
-        .into_iter()
-        .zip(&weights.tensors)
-        .map(|((_, size), values)| Var::from_slice(values, size, &Device::Cpu))
+    let vars = variables(weights, &Device::Cpu)?;
+    let most = ACTIVATIONS / shape.hidden.max(shape.dims);
+    let parts: Vec<_> = rows
+        .par_chunks(most.clamp(1, PART))
+        .map(|part| {
+            let share = part.len() as f64 / rows.len() as f64;
+            let loss = loss(options, weights, &vars, x, part)?;
+            let value = f64::from(loss.to_scalar::<f32>()?);
+            let gradients = match value.is_finite() {
+                true => Some(loss.backward()?),
+                false => None,
+            };
+            Ok((share, value, gradients))
+        })
         .collect::<TensorResult<_>>()?;
+    let value = parts.iter().map(|(share, value, _)| share * value).sum();
+    if !f64::is_finite(value) {
+        return Ok((value, Vec::new()));
+    }
     let mut sums: Vec<Vec<f32>> = weights.tensors.iter().map(|t| vec![0.0; t.len()]).collect();
-    let mut value = 0.0;
-    for part in rows.chunks((PART / shape.hidden.max(shape.dims)).max(1)) {
-        let share = part.len() as f64 / rows.len() as f64;
-        let loss = loss(options, weights, &vars, x, part)?;
-        value += share * f64::from(loss.to_scalar::<f32>()?);
-        if !value.is_finite() {
-            return Ok((value, Vec::new()));
-        }
-        let gradients = loss.backward()?;
+    for (share, _, gradients) in &parts {
+        let share = *share as f32;
         for (var, sum) in vars.iter().zip(&mut sums) {
-            if let Some(gradient) = gradients.get(var) {
-                let gradient = gradient.flatten_all()?.to_vec1::<f32>()?;
-                sum.iter_mut()
-                    .zip(&gradient)
-                    .for_each(|(s, g)| *s += share as f32 * g);
-            }
+            let Some(gradient) = gradients.as_ref().and_then(|all| all.get(var)) else {
+                continue;
+            };
+            with([gradient], |[gradient]| {
+                let pairs = sum.iter_mut().zip(gradient);
+                pairs.for_each(|(sum, g)| *sum += share * g);
+            })?;
         }
     }
     Ok((value, sums))
+}
+
+/// All parameters, as nodes of a graph.
+fn variables(weights: &Weights, device: &Device) -> TensorResult<Vec<Var>> {
+    let shapes = weights.shape.tensors().into_iter();
+    let var = |((_, size), values): ((String, Vec<usize>), &Vec<f32>)| {
+        Var::from_slice(values, size, device)
+    };
+    shapes.zip(&weights.tensors).map(var).collect()
+}
+
+/// [`gradients`] by candle's own operations on any device.
+pub(super) fn plain_gradients(
+    options: &RealNvpOptions,
+    weights: &Weights,
+    x: &[f32],
+    rows: &[u32],
+    device: &Device,
+) -> TensorResult<(f64, Vec<Vec<f32>>)> {
+    let shape = weights.shape;
+    let vars = variables(weights, device)?;
+    let row = |&row: &u32| &x[row as usize * shape.row()..][..shape.row()];
+    let batch: Vec<f32> = rows.iter().flat_map(row).copied().collect();
+    let batch = Tensor::from_vec(batch, (rows.len(), shape.row()), device)?;
+    let tensors: Vec<Tensor> = vars.iter().map(|var| var.as_tensor().clone()).collect();
+    let loss = plain::loss(options, shape, &tensors, &batch)?;
+    let value = f64::from(loss.to_scalar::<f32>()?);
+    if !value.is_finite() {
+        return Ok((value, Vec::new()));
+    }
+    let gradients = loss.backward()?;
+    let gradient = |var: &Var| match gradients.get(var) {
+        Some(gradient) => gradient.flatten_all()?.to_vec1::<f32>(),
+        None => Ok(vec![0.0; var.elem_count()]),
+    };
+    let all = vars.iter().map(gradient).collect::<TensorResult<_>>()?;
+    Ok((value, all))
 }
 
 /// Mean −ln q of rows of `x`, as a node of the graph.

@@ -1,8 +1,8 @@
 //! The flow once more, in f64 and one row at a time: what the tests compare with.
 
-use super::kernel::SLOPE;
 use super::options::Prior;
 use super::weights::{Shape, Weights, kept};
+use crate::kernel::layer::SLOPE;
 use crate::normal::LN_SQRT_TAU;
 
 /// All parameters in f64; [`Weights`] has the layout.

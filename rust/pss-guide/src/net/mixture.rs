@@ -8,13 +8,16 @@
 //! takes its component by the first number, which is stretched and used again, and each number from the component's
 //! inverse distribution; tails are measured from the end that is nearer, where f32 resolves them.
 
-use super::lanes::{BELOW_ONE, HALF_STEP, LANES, at_least, choose, load, part, softmax, store};
-use super::math::{FRAC_1_SQRT_PI, erfc, exp, inverse_erfc, ln, tanh};
+use pulp::Simd;
+
+use crate::kernel::ROWS;
+use crate::kernel::lanes::{BELOW_ONE, HALF_STEP, Lanes, at_least, choose, softmax};
+use crate::kernel::math::{FRAC_1_SQRT_PI, Functions};
 
 /// Least density; where all components are as far away, exp would leave f32's range.
 const LEAST: f32 = 1e-37;
 
-/// Outputs of the network and what of them is prepared lie as `[value][row]`, `rows` to a value.
+/// Outputs of the network, and what of them is prepared, are blocks of rows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Mixture {
     pub(super) components: usize,
@@ -31,13 +34,13 @@ struct Axis {
 
 impl Axis {
     #[inline(always)]
-    fn new(mean: f32, spread: f32) -> Self {
-        let mu = 0.5 + 0.5 * tanh(mean);
-        let inv = 7.071_068 * exp(-3.0 * tanh(spread * (1.0 / 3.0)));
+    fn new<S: Simd>(simd: S, mean: f32, spread: f32) -> Self {
+        let mu = 0.5 + 0.5 * simd.tanh(mean);
+        let inv = 7.071_068 * simd.exp(-3.0 * simd.tanh(spread * (1.0 / 3.0)));
         Self {
             mu,
             inv,
-            tails: [erfc(mu * inv), erfc((1.0 - mu) * inv)],
+            tails: [simd.erfc(mu * inv), simd.erfc((1.0 - mu) * inv)],
         }
     }
 
@@ -62,7 +65,7 @@ impl Axis {
 
     /// The number below which a share v of the mass lies.
     #[inline(always)]
-    fn inverse(&self, v: f32) -> f32 {
+    fn inverse<S: Simd>(&self, simd: S, v: f32) -> f32 {
         let mass = self.mass();
         let (low, high) = (v * mass, (1.0 - v) * mass);
         let left = low < 1.0 - self.tails[0];
@@ -71,7 +74,7 @@ impl Axis {
         } else {
             self.tails[1] + high
         };
-        let y = inverse_erfc(c.clamp(1e-30, 1.0)) / self.inv;
+        let y = simd.inverse_erfc(c.clamp(1e-30, 1.0)) / self.inv;
         (self.mu + if left { -y } else { y }).clamp(0.0, BELOW_ONE)
     }
 }
@@ -100,203 +103,194 @@ impl Mixture {
         bias
     }
 
-    /// Floats per row that [`Mixture::sample`] and [`Mixture::density`] work in.
+    /// Values per row that [`Mixture::sample`] and [`Mixture::density`] work in.
     pub(super) fn scratch(self) -> usize {
         PREPARED * self.components
     }
 
-    /// Per component: share, height, then mean, width and both tails along each number.
+    /// Per component: share, then for each its height and mean, width and both tails along each number.
     #[inline(always)]
-    fn prepare(self, rows: usize, out: &[f32], scratch: &mut [f32]) {
+    fn prepare<S: Simd>(self, simd: S, out: &[Lanes], scratch: &mut [Lanes]) {
         let n = self.components;
-        let (pi, rest) = scratch.split_at_mut(n * rows);
-        softmax(n, rows, out, pi);
-        let out = &out[n * rows..][..4 * n * rows];
-        for j in 0..n {
-            let row = |v: usize| part(out, v * n + j, rows);
-            let (means, spreads) = ([row(0), row(2)], [row(1), row(3)]);
-            let mut height = part(pi, j, rows);
-            let mine = &mut rest[9 * j * rows..][..9 * rows];
+        let (pi, rest) = scratch.split_at_mut(n);
+        softmax(simd, &out[..n], pi);
+        for (j, mine) in rest.chunks_exact_mut(PREPARED - 1).enumerate() {
+            let row = |v: usize| out[v * n + j];
+            let (means, spreads) = ([row(1), row(3)], [row(2), row(4)]);
+            let mut height = pi[j];
             for (axis, (mean, spread)) in means.iter().zip(&spreads).enumerate() {
-                let mut values = [[0.0; LANES]; 4];
-                for r in 0..rows {
-                    let a = Axis::new(mean[r], spread[r]);
+                let mut values = [Lanes::default(); 4];
+                for r in 0..ROWS {
+                    let a = Axis::new(simd, mean[r], spread[r]);
                     height[r] *= a.peak();
                     (values[0][r], values[1][r]) = (a.mu, a.inv);
                     (values[2][r], values[3][r]) = (a.tails[0], a.tails[1]);
                 }
-                for (i, lanes) in values.iter().enumerate() {
-                    store(mine, 1 + 4 * axis + i, lanes, rows);
-                }
+                mine[1 + 4 * axis..][..4].copy_from_slice(&values);
             }
-            store(mine, 0, &height, rows);
+            mine[0] = height;
         }
     }
 
     /// Density from what is prepared.
     #[inline(always)]
-    fn evaluate(self, rows: usize, prepared: &[f32], [x0, x1]: [&[f32]; 2], q: &mut [f32]) {
-        let n = self.components;
-        let (x0, x1) = (load(x0, rows), load(x1, rows));
-        let mut sum = [LEAST; LANES];
-        for mine in prepared[n * rows..].chunks_exact(9 * rows).take(n) {
-            let part = |i| part(mine, i, rows);
-            let (height, mu0, inv0, mu1, inv1) = (part(0), part(1), part(2), part(5), part(6));
-            for r in 0..rows {
+    fn evaluate<S: Simd>(self, simd: S, prepared: &[Lanes], [x0, x1]: &[Lanes; 2]) -> Lanes {
+        let mut sum = Lanes::all(LEAST);
+        for mine in prepared[self.components..].chunks_exact(PREPARED - 1) {
+            let (height, mu0, inv0, mu1, inv1) = (mine[0], mine[1], mine[2], mine[5], mine[6]);
+            for r in 0..ROWS {
                 let (z0, z1) = ((x0[r] - mu0[r]) * inv0[r], (x1[r] - mu1[r]) * inv1[r]);
-                sum[r] += height[r] * exp(-(z0 * z0 + z1 * z1));
+                sum[r] += height[r] * simd.exp(-simd.fma(z0, z0, z1 * z1));
             }
         }
-        store(q, 0, &sum, rows);
+        sum
     }
 
     /// Densities of pairs.
     #[inline(always)]
-    pub(super) fn density(
+    pub(super) fn density<S: Simd>(
         self,
-        rows: usize,
-        out: &[f32],
-        u: [&[f32]; 2],
-        q: &mut [f32],
-        scratch: &mut [f32],
-    ) {
-        self.prepare(rows, out, scratch);
-        self.evaluate(rows, scratch, u, q);
+        simd: S,
+        out: &[Lanes],
+        u: &[Lanes; 2],
+        scratch: &mut [Lanes],
+    ) -> Lanes {
+        self.prepare(simd, out, scratch);
+        self.evaluate(simd, scratch, u)
     }
 
     /// Turns uniform pairs into guided ones, and gives their densities.
     #[inline(always)]
-    pub(super) fn sample(
+    pub(super) fn sample<S: Simd>(
         self,
-        rows: usize,
-        out: &[f32],
-        [u0, u1]: [&mut [f32]; 2],
-        q: &mut [f32],
-        scratch: &mut [f32],
-    ) {
-        self.prepare(rows, out, scratch);
-        let n = self.components;
-        let (pi, rest) = scratch.split_at(n * rows);
-        let (mut x0, mut x1) = (load(u0, rows), load(u1, rows));
-        let mut below = [0.0; LANES];
+        simd: S,
+        out: &[Lanes],
+        u: &mut [Lanes; 2],
+        scratch: &mut [Lanes],
+    ) -> Lanes {
+        self.prepare(simd, out, scratch);
+        let (pi, rest) = scratch.split_at(self.components);
+        let [mut x0, mut x1] = *u;
+        let mut below = Lanes::default();
         // What a sample wants of its component: where its interval begins, its share, and all that is prepared but the height.
-        let mut chosen = [[0.0; LANES]; 10];
+        let mut chosen = [Lanes::default(); 10];
         // The last component whose interval begins no higher than the number; chosen by masks, so that rows stay vectors.
-        for (j, component) in rest.chunks_exact(9 * rows).take(n).enumerate() {
-            let pi = part(pi, j, rows);
-            let mask = at_least(rows, &x0, &below);
+        for (pi, component) in pi.iter().zip(rest.chunks_exact(PREPARED - 1)) {
+            let mask = at_least(&x0, &below);
             for (i, chosen) in chosen.iter_mut().enumerate() {
                 let from = match i {
-                    0 => below,
+                    0 => &below,
                     1 => pi,
-                    _ => part(component, i - 1, rows),
+                    _ => &component[i - 1],
                 };
-                *chosen = choose(rows, &mask, &from, chosen);
+                *chosen = choose(&mask, from, chosen);
             }
-            for r in 0..rows {
+            for r in 0..ROWS {
                 below[r] += pi[r];
             }
         }
         let [low, pi, mu0, inv0, low0, high0, mu1, inv1, low1, high1] = chosen;
-        for r in 0..rows {
+        for r in 0..ROWS {
             let axis = |mu, inv, low, high| Axis {
                 mu,
                 inv,
                 tails: [low, high],
             };
             let v = ((x0[r] + HALF_STEP - low[r]) / pi[r]).clamp(0.0, 1.0);
-            x0[r] = axis(mu0[r], inv0[r], low0[r], high0[r]).inverse(v);
-            x1[r] = axis(mu1[r], inv1[r], low1[r], high1[r]).inverse(x1[r] + HALF_STEP);
+            x0[r] = axis(mu0[r], inv0[r], low0[r], high0[r]).inverse(simd, v);
+            x1[r] = axis(mu1[r], inv1[r], low1[r], high1[r]).inverse(simd, x1[r] + HALF_STEP);
         }
-        store(u0, 0, &x0, rows);
-        store(u1, 0, &x1, rows);
-        self.evaluate(rows, scratch, [u0, u1], q);
+        *u = [x0, x1];
+        self.evaluate(simd, scratch, u)
     }
 
     /// ln q of pairs, and its derivative by each output.
     #[inline(always)]
-    pub(super) fn learn(
+    pub(super) fn learn<S: Simd>(
         self,
-        rows: usize,
-        out: &[f32],
-        u: [&[f32]; 2],
-        log_q: &mut [f32],
-        slope: &mut [f32],
-        scratch: &mut [f32],
-    ) {
+        simd: S,
+        out: &[Lanes],
+        u: &[Lanes; 2],
+        slope: &mut [Lanes],
+        scratch: &mut [Lanes],
+    ) -> Lanes {
         let n = self.components;
-        self.weigh(rows, out, u, log_q, scratch);
-        let (pi, weights) = scratch.split_at(n * rows);
-        let x = u.map(|u| load(u, rows));
+        let log_q = self.weigh(simd, out, u, scratch);
+        let (pi, rest) = scratch.split_at(n);
+        let (shares, axes) = rest.split_at(n);
         for j in 0..n {
-            let row = |v: usize| part(out, v * n + j, rows);
-            let (pi, share) = (part(pi, j, rows), part(weights, j, rows));
-            let mut by_share = [0.0; LANES];
-            for r in 0..rows {
+            let (pi, share) = (pi[j], shares[j]);
+            let mut by_share = Lanes::default();
+            for r in 0..ROWS {
                 by_share[r] = share[r] - pi[r];
             }
-            store(slope, j, &by_share, rows);
-            for (axis, x) in x.iter().enumerate() {
-                let (mean, spread) = (row(1 + 2 * axis), row(2 + 2 * axis));
-                let (mut by_mean, mut by_spread) = ([0.0; LANES], [0.0; LANES]);
-                for r in 0..rows {
-                    let (tm, ts) = (tanh(mean[r]), tanh(spread[r] * (1.0 / 3.0)));
-                    let a = Axis::new(mean[r], spread[r]);
-                    let z = (x[r] - a.mu) * a.inv;
-                    let (near, far) = (a.mu, 1.0 - a.mu);
-                    let (y0, y1) = (near * a.inv, far * a.inv);
-                    let (e0, e1) = (exp(-y0 * y0), exp(-y1 * y1));
-                    let edge = 2.0 * FRAC_1_SQRT_PI * a.inv / a.mass();
-                    let d_mean = 2.0 * a.inv * z - edge * (e0 - e1);
+            slope[j] = by_share;
+            for (axis, x) in u.iter().enumerate() {
+                let [mu, inv, mass] = [0, 1, 2].map(|i| axes[6 * j + 3 * axis + i]);
+                let spread = out[(2 + 2 * axis) * n + j];
+                let (mut by_mean, mut by_spread) = (Lanes::default(), Lanes::default());
+                for r in 0..ROWS {
+                    // μ = ½ + ½ tanh(output), so that 1 − tanh² is 4 μ (1 − μ).
+                    let (near, far) = (mu[r], 1.0 - mu[r]);
+                    let ts = simd.tanh(spread[r] * (1.0 / 3.0));
+                    let z = (x[r] - mu[r]) * inv[r];
+                    let (y0, y1) = (near * inv[r], far * inv[r]);
+                    let (e0, e1) = (simd.exp(-y0 * y0), simd.exp(-y1 * y1));
+                    let edge = 2.0 * FRAC_1_SQRT_PI * inv[r] / mass[r];
+                    let d_mean = 2.0 * inv[r] * z - edge * (e0 - e1);
                     let d_spread = 2.0 * z * z - 1.0 + edge * (far * e1 + near * e0);
-                    by_mean[r] = share[r] * d_mean * 0.5 * (1.0 - tm * tm);
+                    by_mean[r] = share[r] * d_mean * 2.0 * near * far;
                     by_spread[r] = share[r] * d_spread * (1.0 - ts * ts);
                 }
-                store(slope, (1 + 2 * axis) * n + j, &by_mean, rows);
-                store(slope, (2 + 2 * axis) * n + j, &by_spread, rows);
+                slope[(1 + 2 * axis) * n + j] = by_mean;
+                slope[(2 + 2 * axis) * n + j] = by_spread;
             }
         }
+        log_q
     }
 
-    /// Shares π, then each component's share of the density at u, and ln q.
+    /// Shares π, then each component's share of the density at u, then its μ, width and mass along each number; gives ln q.
     #[inline(always)]
-    fn weigh(
+    fn weigh<S: Simd>(
         self,
-        rows: usize,
-        out: &[f32],
-        [x0, x1]: [&[f32]; 2],
-        log_q: &mut [f32],
-        scratch: &mut [f32],
-    ) {
+        simd: S,
+        out: &[Lanes],
+        u: &[Lanes; 2],
+        scratch: &mut [Lanes],
+    ) -> Lanes {
         let n = self.components;
-        let x = [load(x0, rows), load(x1, rows)];
-        let (pi, weights) = scratch.split_at_mut(n * rows);
-        softmax(n, rows, out, pi);
-        let mut sum = [LEAST; LANES];
+        let (pi, rest) = scratch.split_at_mut(n);
+        let (weights, axes) = rest.split_at_mut(n);
+        softmax(simd, &out[..n], pi);
+        let mut sum = Lanes::all(LEAST);
         for j in 0..n {
-            let row = |v: usize| part(out, v * n + j, rows);
-            let (mut weight, mut fall) = (part(pi, j, rows), [0.0; LANES]);
-            for (axis, x) in x.iter().enumerate() {
-                let (mean, spread) = (row(1 + 2 * axis), row(2 + 2 * axis));
-                for r in 0..rows {
-                    let a = Axis::new(mean[r], spread[r]);
+            let (mut weight, mut fall) = (pi[j], Lanes::default());
+            for (axis, x) in u.iter().enumerate() {
+                let (mean, spread) = (out[(1 + 2 * axis) * n + j], out[(2 + 2 * axis) * n + j]);
+                let mut kept = [Lanes::default(); 3];
+                for r in 0..ROWS {
+                    let a = Axis::new(simd, mean[r], spread[r]);
                     weight[r] *= a.peak();
                     fall[r] += a.fall(x[r]);
+                    (kept[0][r], kept[1][r], kept[2][r]) = (a.mu, a.inv, a.mass());
                 }
+                axes[6 * j + 3 * axis..][..3].copy_from_slice(&kept);
             }
-            for r in 0..rows {
-                weight[r] *= exp(-fall[r]);
+            for r in 0..ROWS {
+                weight[r] *= simd.exp(-fall[r]);
                 sum[r] += weight[r];
             }
-            store(weights, j, &weight, rows);
+            weights[j] = weight;
         }
-        store(log_q, 0, &sum, rows);
-        let log_q = &mut log_q[..rows];
-        for weight in weights.chunks_exact_mut(rows).take(n) {
-            for (weight, q) in weight.iter_mut().zip(log_q.iter()) {
-                *weight /= q;
+        for weight in weights.iter_mut() {
+            for r in 0..ROWS {
+                weight[r] /= sum[r];
             }
         }
-        log_q.iter_mut().for_each(|q| *q = ln(*q));
+        let mut log_q = Lanes::default();
+        for r in 0..ROWS {
+            log_q[r] = simd.ln(sum[r]);
+        }
+        log_q
     }
 }

@@ -3,8 +3,9 @@
 use pss_rng::{Purpose, Stream};
 
 use crate::Context;
-use crate::flow::kernel::{Linear, SLOPE, inside};
-use crate::flow::product::{Strided, multiply};
+use crate::kernel::layer::{Linear, SLOPE};
+use crate::kernel::math::inside;
+use crate::kernel::product::{Strided, multiply};
 use crate::table::cells::Grid;
 
 /// Numbers that tell where a vertex is: position, normal, outgoing direction, bounce.

@@ -11,8 +11,6 @@
 //! composite it is fitted on f²/g of what the factors before it leave, as every guide is ([`crate::Recipe::fit`]). Learned mixtures
 //! for path guiding: Huang et al. 2024, doi:10.1145/3649310; here over primary numbers, so that the BSDF is part of what is learnt.
 
-mod lanes;
-mod math;
 mod mixture;
 mod mlp;
 mod model;
@@ -33,7 +31,7 @@ use crate::predict::HeldOut;
 use crate::records::Clipped;
 use crate::{Context, Decision, Fit, Guide, GuideError, Records};
 
-/// Seconds on one core that a decision, forward and back, takes with the default network, as `examples/guide_cost.rs` shows.
+/// Seconds on one core that a decision, forward and back, takes with the default network, as `examples/guide_cost` shows.
 const SECONDS_PER_DECISION: f64 = 1.4e-6;
 
 /// Multiplications of the default `mixture-net`.

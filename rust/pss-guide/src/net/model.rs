@@ -7,7 +7,9 @@ use super::mlp::{FEATURES, Mlp, Place};
 use super::options::Options;
 use super::spline::Spline;
 use crate::Context;
-use crate::flow::kernel::{Linear, TILE};
+use crate::kernel::lanes::Lanes;
+use crate::kernel::layer::{Linear, TILE};
+use crate::kernel::{ROWS, dispatch};
 
 /// The density that a network's outputs stand for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -60,50 +62,48 @@ impl Head {
     }
 
     #[inline(always)]
-    fn sample(
+    fn sample<S: Simd>(
         self,
+        simd: S,
         stage: usize,
-        rows: usize,
-        out: &[f32],
-        u: [&mut [f32]; 2],
-        q: &mut [f32],
-        scratch: &mut [f32],
-    ) {
+        out: &[Lanes],
+        u: &mut [Lanes; 2],
+        scratch: &mut [Lanes],
+    ) -> Lanes {
         match self {
-            Self::Mixture(m) => m.sample(rows, out, u, q, scratch),
-            Self::Spline(s) => s.sample(rows, out, u[stage], q, scratch),
+            Self::Mixture(m) => m.sample(simd, out, u, scratch),
+            Self::Spline(s) => s.sample(simd, out, &mut u[stage], scratch),
         }
     }
 
     #[inline(always)]
-    fn density(
+    fn density<S: Simd>(
         self,
+        simd: S,
         stage: usize,
-        rows: usize,
-        out: &[f32],
-        u: [&[f32]; 2],
-        q: &mut [f32],
-        scratch: &mut [f32],
-    ) {
+        out: &[Lanes],
+        u: &[Lanes; 2],
+        scratch: &mut [Lanes],
+    ) -> Lanes {
         match self {
-            Self::Mixture(m) => m.density(rows, out, u, q, scratch),
-            Self::Spline(s) => s.density(rows, out, u[stage], q, scratch),
+            Self::Mixture(m) => m.density(simd, out, u, scratch),
+            Self::Spline(s) => s.density(simd, out, &u[stage], scratch),
         }
     }
 
     #[inline(always)]
-    fn learn(
+    fn learn<S: Simd>(
         self,
+        simd: S,
         stage: usize,
-        rows: usize,
-        out: &[f32],
-        u: [&[f32]; 2],
-        [log_q, slope]: [&mut [f32]; 2],
-        scratch: &mut [f32],
-    ) {
+        out: &[Lanes],
+        u: &[Lanes; 2],
+        slope: &mut [Lanes],
+        scratch: &mut [Lanes],
+    ) -> Lanes {
         match self {
-            Self::Mixture(m) => m.learn(rows, out, u, log_q, slope, scratch),
-            Self::Spline(s) => s.learn(rows, out, u[stage], log_q, slope, scratch),
+            Self::Mixture(m) => m.learn(simd, out, u, slope, scratch),
+            Self::Spline(s) => s.learn(simd, out, &u[stage], slope, scratch),
         }
     }
 }
@@ -140,15 +140,6 @@ impl Model {
     }
 }
 
-/// Runs `op` with the widest vectors that the heads were written for.
-fn dispatch<O: WithSimd>(op: O) -> O::Output {
-    #[cfg(target_arch = "x86_64")]
-    if let Some(simd) = pulp::x86::V3::try_new() {
-        return Simd::vectorize(simd, op);
-    }
-    pulp::Arch::new().dispatch(op)
-}
-
 struct Learn<'a> {
     head: Head,
     stage: usize,
@@ -161,30 +152,32 @@ impl WithSimd for Learn<'_> {
     type Output = ();
 
     #[inline(always)]
-    fn with_simd<S: Simd>(self, _: S) {
-        let (rows, n) = (2 * S::F32_LANES, self.head.outputs());
-        let mut block = vec![0.0; n * rows];
-        let mut slope = vec![0.0; n * rows];
-        let mut scratch = vec![0.0; self.head.scratch() * rows];
-        let (mut u, mut q) = ([vec![0.5; rows], vec![0.5; rows]], vec![0.0; rows]);
-        let blocks = self.out.chunks_mut(n * rows).zip(self.u.chunks(2 * rows));
-        for ((out, pairs), log_q) in blocks.zip(self.log_q.chunks_mut(rows)) {
+    fn with_simd<S: Simd>(self, simd: S) {
+        let n = self.head.outputs();
+        let mut block = vec![Lanes::default(); n];
+        let mut slope = vec![Lanes::default(); n];
+        let mut scratch = vec![Lanes::default(); self.head.scratch()];
+        let mut u = [Lanes::all(0.5); 2];
+        let blocks = self.out.chunks_mut(n * ROWS).zip(self.u.chunks(2 * ROWS));
+        for ((out, pairs), log_q) in blocks.zip(self.log_q.chunks_mut(ROWS)) {
             for (r, (out, pair)) in out.chunks_exact(n).zip(pairs.chunks_exact(2)).enumerate() {
-                for (o, &value) in out.iter().enumerate() {
-                    block[o * rows + r] = value;
+                for (block, &value) in block.iter_mut().zip(out) {
+                    block[r] = value;
                 }
                 (u[0][r], u[1][r]) = (pair[0], pair[1]);
             }
-            let pair = [&u[0][..], &u[1][..]];
-            let to = [&mut q[..], &mut slope[..]];
-            self.head
-                .learn(self.stage, rows, &block, pair, to, &mut scratch);
+            let log = self
+                .head
+                .learn(simd, self.stage, &block, &u, &mut slope, &mut scratch);
             for (r, out) in out.chunks_exact_mut(n).enumerate() {
-                for (o, value) in out.iter_mut().enumerate() {
-                    *value = slope[o * rows + r];
+                for (value, slope) in out.iter_mut().zip(&slope) {
+                    *value = slope[r];
                 }
             }
-            log_q.iter_mut().zip(&q).for_each(|(to, q)| *to += q);
+            log_q
+                .iter_mut()
+                .zip(&log.0)
+                .for_each(|(to, log)| *to += log);
         }
     }
 }
@@ -195,7 +188,7 @@ pub(super) struct Packed {
     head: Head,
     place: Place,
     nets: Vec<Vec<Linear>>,
-    /// Floats per row that the widest layer takes, its padding included.
+    /// Values per row that the widest layer takes, its padding included.
     width: usize,
 }
 
@@ -248,52 +241,43 @@ impl WithSimd for Pass<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        let (rows, model) = (2 * S::F32_LANES, self.model);
+        let model = self.model;
         let nowhere = Context::default();
-        // Values of a block lie one after another: value = block[column * rows + row].
-        let mut inputs = vec![0.0; (FEATURES + 2) * rows];
-        let mut ping = vec![0.0; model.width * rows];
+        let mut inputs = [Lanes::default(); FEATURES + 1];
+        let mut ping = vec![Lanes::default(); model.width];
         let mut pong = ping.clone();
-        let mut scratch = vec![0.0; model.head.scratch() * rows];
-        let (mut u0, mut u1) = (vec![0.5; rows], vec![0.5; rows]);
-        let mut density = vec![0.0; rows];
+        let mut scratch = vec![Lanes::default(); model.head.scratch()];
+        let mut u = [Lanes::all(0.5); 2];
         let mut first = 0;
-        for (pairs, q) in self.u.chunks_mut(2 * rows).zip(self.q.chunks_mut(rows)) {
+        for (pairs, q) in self.u.chunks_mut(2 * ROWS).zip(self.q.chunks_mut(ROWS)) {
             for (r, pair) in pairs.chunks_exact(2).enumerate() {
-                (u0[r], u1[r]) = (pair[0], pair[1]);
+                (u[0][r], u[1][r]) = (pair[0], pair[1]);
                 let c = self.contexts.get(first + r).unwrap_or(&nowhere);
-                for (i, x) in model.place.features(c).into_iter().enumerate() {
-                    inputs[i * rows + r] = x;
+                for (input, x) in inputs.iter_mut().zip(model.place.features(c)) {
+                    input[r] = x;
                 }
             }
-            first += rows;
+            first += ROWS;
             q.fill(1.0);
             for (stage, net) in model.nets.iter().enumerate() {
-                for seen in 0..stage {
-                    let to = &mut inputs[(FEATURES + seen) * rows..][..rows];
-                    to.copy_from_slice(if seen == 0 { &u0 } else { &u1 });
+                if stage > 0 {
+                    inputs[FEATURES] = u[0];
                 }
                 for (i, layer) in net.iter().enumerate() {
-                    let input = if i == 0 { &inputs } else { &ping };
+                    let input = if i == 0 { &inputs[..] } else { &ping[..] };
                     layer.apply(simd, input, &mut pong, i + 1 < net.len());
                     std::mem::swap(&mut ping, &mut pong);
                 }
-                if self.draw {
-                    let u = [&mut u0[..], &mut u1[..]];
-                    model
-                        .head
-                        .sample(stage, rows, &ping, u, &mut density, &mut scratch);
+                let density = if self.draw {
+                    model.head.sample(simd, stage, &ping, &mut u, &mut scratch)
                 } else {
-                    let u = [&u0[..], &u1[..]];
-                    model
-                        .head
-                        .density(stage, rows, &ping, u, &mut density, &mut scratch);
-                }
-                q.iter_mut().zip(&density).for_each(|(q, d)| *q *= d);
+                    model.head.density(simd, stage, &ping, &u, &mut scratch)
+                };
+                q.iter_mut().zip(&density.0).for_each(|(q, d)| *q *= d);
             }
             if self.draw {
                 for (r, pair) in pairs.chunks_exact_mut(2).enumerate() {
-                    (pair[0], pair[1]) = (u0[r], u1[r]);
+                    (pair[0], pair[1]) = (u[0][r], u[1][r]);
                 }
             }
         }

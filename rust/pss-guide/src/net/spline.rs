@@ -19,8 +19,11 @@
 //! parametrisation `uniform`, the second of some microfacets). A hemisphere takes both through the concentric map of the
 //! disk, and under `bsdf` a layered surface spends part of the first on the choice of its lobe.
 
-use super::lanes::{BELOW_ONE, HALF_STEP, LANES, Lanes, at_least, choose, part, softmax, store};
-use super::math::{exp, ln, tanh};
+use pulp::Simd;
+
+use crate::kernel::ROWS;
+use crate::kernel::lanes::{BELOW_ONE, HALF_STEP, Lanes, at_least, choose, softmax};
+use crate::kernel::math::Functions;
 
 /// Least width and height of a bin.
 const LEAST: f32 = 1e-3;
@@ -28,7 +31,7 @@ const LEAST: f32 = 1e-3;
 /// ln of the largest slope; that of the smallest is its negative.
 const STEEPEST: f32 = 6.907_755;
 
-/// Outputs lie as `[value][row]`: logits of widths, logits of heights, slopes.
+/// Outputs: logits of widths, logits of heights, slopes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Spline {
     pub(super) bins: usize,
@@ -58,8 +61,8 @@ enum By {
 
 /// Slope of an output.
 #[inline(always)]
-fn steep(raw: f32) -> f32 {
-    exp(STEEPEST * tanh(raw * (1.0 / STEEPEST)))
+fn steep<S: Simd>(simd: S, raw: f32) -> f32 {
+    simd.exp(STEEPEST * simd.tanh(raw * (1.0 / STEEPEST)))
 }
 
 /// A bin along one row.
@@ -120,7 +123,7 @@ impl Spline {
         vec![0.0; self.outputs()]
     }
 
-    /// Floats per row that the functions below work in.
+    /// Values per row that the functions below work in.
     pub(super) fn scratch(self) -> usize {
         2 * self.bins
     }
@@ -133,29 +136,36 @@ impl Spline {
 
     /// The last bin that begins no higher than `at`; chosen by masks, so that rows stay vectors. Leaves the shares in `scratch`.
     #[inline(always)]
-    fn find(self, by: By, rows: usize, out: &[f32], at: &Lanes, scratch: &mut [f32]) -> Bin {
+    fn find<S: Simd>(
+        self,
+        simd: S,
+        by: By,
+        out: &[Lanes],
+        at: &Lanes,
+        scratch: &mut [Lanes],
+    ) -> Bin {
         let n = self.bins;
-        let (widths, heights) = scratch.split_at_mut(n * rows);
-        softmax(n, rows, out, widths);
-        softmax(n, rows, &out[n * rows..], heights);
-        let (mut x, mut y) = ([0.0; LANES], [0.0; LANES]);
+        let (widths, heights) = scratch.split_at_mut(n);
+        softmax(simd, &out[..n], widths);
+        softmax(simd, &out[n..2 * n], heights);
+        let (mut x, mut y) = (Lanes::default(), Lanes::default());
         let mut bin = Bin::default();
         for j in 0..n {
-            let (w, h) = (part(widths, j, rows), part(heights, j, rows));
-            let (raw0, raw1) = (part(out, 2 * n + j, rows), part(out, 2 * n + j + 1, rows));
-            let mask = at_least(rows, at, if by == By::X { &x } else { &y });
+            let (w, h) = (widths[j], heights[j]);
+            let (raw0, raw1) = (out[2 * n + j], out[2 * n + j + 1]);
+            let mask = at_least(at, if by == By::X { &x } else { &y });
             bin = Bin {
-                index: choose(rows, &mask, &[j as f32; LANES], &bin.index),
-                x: choose(rows, &mask, &x, &bin.x),
-                y: choose(rows, &mask, &y, &bin.y),
-                share_w: choose(rows, &mask, &w, &bin.share_w),
-                share_h: choose(rows, &mask, &h, &bin.share_h),
+                index: choose(&mask, &Lanes::all(j as f32), &bin.index),
+                x: choose(&mask, &x, &bin.x),
+                y: choose(&mask, &y, &bin.y),
+                share_w: choose(&mask, &w, &bin.share_w),
+                share_h: choose(&mask, &h, &bin.share_h),
                 raw: [
-                    choose(rows, &mask, &raw0, &bin.raw[0]),
-                    choose(rows, &mask, &raw1, &bin.raw[1]),
+                    choose(&mask, &raw0, &bin.raw[0]),
+                    choose(&mask, &raw1, &bin.raw[1]),
                 ],
             };
-            for r in 0..rows {
+            for r in 0..ROWS {
                 x[r] += self.size(w[r]);
                 y[r] += self.size(h[r]);
             }
@@ -164,97 +174,94 @@ impl Spline {
     }
 
     #[inline(always)]
-    fn piece(self, bin: &Bin, r: usize) -> Piece {
+    fn piece<S: Simd>(self, simd: S, bin: &Bin, r: usize) -> Piece {
         let w = self.size(bin.share_w[r]);
         Piece {
             w,
             s: self.size(bin.share_h[r]) / w,
-            d: [steep(bin.raw[0][r]), steep(bin.raw[1][r])],
+            d: [steep(simd, bin.raw[0][r]), steep(simd, bin.raw[1][r])],
         }
     }
 
     /// Densities of one number of each row.
     #[inline(always)]
-    pub(super) fn density(
+    pub(super) fn density<S: Simd>(
         self,
-        rows: usize,
-        out: &[f32],
-        x: &[f32],
-        q: &mut [f32],
-        scratch: &mut [f32],
-    ) {
-        let x = part(x, 0, rows);
-        let bin = self.find(By::X, rows, out, &x, scratch);
-        let mut density = [0.0; LANES];
-        for r in 0..rows {
-            density[r] = self.piece(&bin, r).density(x[r] - bin.x[r]);
+        simd: S,
+        out: &[Lanes],
+        x: &Lanes,
+        scratch: &mut [Lanes],
+    ) -> Lanes {
+        let x = *x;
+        let bin = self.find(simd, By::X, out, &x, scratch);
+        let mut density = Lanes::default();
+        for r in 0..ROWS {
+            density[r] = self.piece(simd, &bin, r).density(x[r] - bin.x[r]);
         }
-        store(q, 0, &density, rows);
+        density
     }
 
     /// Turns uniform numbers into guided ones, and gives their densities.
     #[inline(always)]
-    pub(super) fn sample(
+    pub(super) fn sample<S: Simd>(
         self,
-        rows: usize,
-        out: &[f32],
-        u: &mut [f32],
-        q: &mut [f32],
-        scratch: &mut [f32],
-    ) {
-        let mut x = part(u, 0, rows);
-        for x in &mut x[..rows] {
+        simd: S,
+        out: &[Lanes],
+        u: &mut Lanes,
+        scratch: &mut [Lanes],
+    ) -> Lanes {
+        let mut x = *u;
+        for x in &mut x.0 {
             *x += HALF_STEP;
         }
-        let bin = self.find(By::Y, rows, out, &x, scratch);
-        let mut density = [0.0; LANES];
-        for r in 0..rows {
-            let piece = self.piece(&bin, r);
+        let bin = self.find(simd, By::Y, out, &x, scratch);
+        let mut density = Lanes::default();
+        for r in 0..ROWS {
+            let piece = self.piece(simd, &bin, r);
             let eta = (x[r] - bin.y[r]) / self.size(bin.share_h[r]);
             let to = bin.x[r] + piece.w * piece.inverse(eta.clamp(0.0, 1.0));
             x[r] = to.clamp(0.0, BELOW_ONE);
             // That of the number as rounded: it is what the caller gets.
             density[r] = piece.density(x[r] - bin.x[r]);
         }
-        store(u, 0, &x, rows);
-        store(q, 0, &density, rows);
+        *u = x;
+        density
     }
 
     /// ln q of one number of each row, and its derivative by each output.
     #[inline(always)]
-    pub(super) fn learn(
+    pub(super) fn learn<S: Simd>(
         self,
-        rows: usize,
-        out: &[f32],
-        x: &[f32],
-        log_q: &mut [f32],
-        slope: &mut [f32],
-        scratch: &mut [f32],
-    ) {
+        simd: S,
+        out: &[Lanes],
+        x: &Lanes,
+        slope: &mut [Lanes],
+        scratch: &mut [Lanes],
+    ) -> Lanes {
         let n = self.bins;
         let rest = 1.0 - LEAST * n as f32;
-        let x = part(x, 0, rows);
-        let bin = self.find(By::X, rows, out, &x, scratch);
-        let (mut log, zero) = ([0.0; LANES], [0.0; LANES]);
+        let x = *x;
+        let bin = self.find(simd, By::X, out, &x, scratch);
+        let (mut log, zero) = (Lanes::default(), Lanes::default());
         // By the bin's width, by its height, by where it begins, and by the outputs for both slopes.
         let (mut by_w, mut by_h, mut by_x, mut by_raw) = (zero, zero, zero, [zero; 2]);
         // Means of the derivatives by widths and by heights, weighted by the shares.
         let (mut mean_w, mut mean_h) = (zero, zero);
-        for r in 0..rows {
-            let piece = self.piece(&bin, r);
+        for r in 0..ROWS {
+            let piece = self.piece(simd, &bin, r);
             let Piece { w, s, d } = piece;
             let xi = piece.xi(x[r] - bin.x[r]);
             let (a, b) = piece.fraction(xi);
             let (e, rest_xi) = (xi * (1.0 - xi), 1.0 - xi);
             let (ia, ib) = (1.0 / a, 2.0 / b);
-            log[r] = 2.0 * ln(s / b) + ln(a);
+            log[r] = 2.0 * simd.ln(s / b) + simd.ln(a);
             let by_s = 2.0 / s + 2.0 * e * ia - (1.0 - 2.0 * e) * ib;
             let by_xi = 2.0 * (d[1] * xi + s * (1.0 - 2.0 * xi) - d[0] * rest_xi) * ia
                 - (d[0] + d[1] - 2.0 * s) * (1.0 - 2.0 * xi) * ib;
             by_raw[0][r] = (rest_xi * rest_xi * ia - e * ib) * d[0];
             by_raw[1][r] = (xi * xi * ia - e * ib) * d[1];
             for (by, raw) in by_raw.iter_mut().zip(&bin.raw) {
-                let t = tanh(raw[r] * (1.0 / STEEPEST));
+                let t = simd.tanh(raw[r] * (1.0 / STEEPEST));
                 by[r] *= 1.0 - t * t;
             }
             let iw = 1.0 / w;
@@ -265,13 +272,13 @@ impl Spline {
             mean_w[r] = by_x[r] * below + by_w[r] * bin.share_w[r];
             mean_h[r] = by_h[r] * bin.share_h[r];
         }
-        let (widths, heights) = scratch.split_at(n * rows);
+        let (widths, heights) = scratch.split_at(n);
         for j in 0..=n {
             let at = j as f32;
             if j < n {
-                let (w, h) = (part(widths, j, rows), part(heights, j, rows));
+                let (w, h) = (widths[j], heights[j]);
                 let (mut own_w, mut own_h) = (zero, zero);
-                for r in 0..rows {
+                for r in 0..ROWS {
                     let here = at == bin.index[r];
                     let before = if at < bin.index[r] { by_x[r] } else { 0.0 };
                     let moved = if here { by_w[r] } else { before };
@@ -279,11 +286,11 @@ impl Spline {
                     own_w[r] = rest * w[r] * (moved - mean_w[r]);
                     own_h[r] = rest * h[r] * (raised - mean_h[r]);
                 }
-                store(slope, j, &own_w, rows);
-                store(slope, n + j, &own_h, rows);
+                slope[j] = own_w;
+                slope[n + j] = own_h;
             }
             let mut own = zero;
-            for r in 0..rows {
+            for r in 0..ROWS {
                 let left = if at == bin.index[r] {
                     by_raw[0][r]
                 } else {
@@ -295,8 +302,8 @@ impl Spline {
                     left
                 };
             }
-            store(slope, 2 * n + j, &own, rows);
+            slope[2 * n + j] = own;
         }
-        store(log_q, 0, &log, rows);
+        log
     }
 }

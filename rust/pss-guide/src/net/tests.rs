@@ -3,6 +3,7 @@
 
 use candle_core::{D, DType, Device, Result, Tensor, Var};
 use pss_rng::{Purpose, Stream};
+use pulp::Scalar;
 use serde_json::json;
 
 use super::Kind;
@@ -12,7 +13,9 @@ use super::options::Options;
 use super::spline::Spline;
 use super::train::{self, Data};
 use crate::Context;
-use crate::flow::kernel::SLOPE;
+use crate::kernel::ROWS;
+use crate::kernel::lanes::Lanes;
+use crate::kernel::layer::SLOPE;
 
 const KINDS: [Kind; 2] = [Kind::Mixture, Kind::Spline];
 
@@ -22,6 +25,10 @@ const SIZES: [(usize, usize, usize); 3] = [(6, 32, 2), (1, 5, 1), (3, 13, 3)];
 fn uniform(n: usize, stream: u32) -> Vec<f32> {
     let mut numbers = Stream::new(41, Purpose::Test).sequence(stream, 0);
     (0..n).map(|_| numbers.next_f32()).collect()
+}
+
+fn lanes(values: &[f32]) -> Lanes {
+    Lanes(values.try_into().unwrap())
 }
 
 fn options(kind: Kind, (parts, hidden, layers): (usize, usize, usize)) -> Options {
@@ -328,16 +335,17 @@ fn exact_spline(out: &[f64], x: f64) -> (f64, f64) {
 fn a_splines_derivatives_are_central_differences() {
     for (bins, gain) in [(2, 1.0), (5, 3.0), (8, 6.0), (16, 12.0)] {
         let spline = Spline { bins };
-        let (n, rows) = (spline.outputs(), 8);
-        let mut x = uniform(rows, 20);
+        let n = spline.outputs();
+        let mut x = uniform(ROWS, 20);
         (x[0], x[1], x[2]) = (0.0, 1.0 - f32::EPSILON / 2.0, f32::MIN_POSITIVE);
         let number = |u: &f32| gain * (2.0 * u - 1.0);
-        let out: Vec<f32> = uniform(n * rows, 21).iter().map(number).collect();
-        let (mut log, mut slope) = (vec![0.0; rows], vec![0.0; n * rows]);
-        let mut scratch = vec![0.0; spline.scratch() * rows];
-        spline.learn(rows, &out, &x, &mut log, &mut slope, &mut scratch);
+        let out: Vec<f32> = uniform(n * ROWS, 21).iter().map(number).collect();
+        let out: Vec<Lanes> = out.chunks_exact(ROWS).map(lanes).collect();
+        let mut slope = vec![Lanes::default(); n];
+        let mut scratch = vec![Lanes::default(); spline.scratch()];
+        let log = spline.learn(Scalar, &out, &lanes(&x), &mut slope, &mut scratch);
         for (r, &x) in x.iter().enumerate() {
-            let mut own: Vec<f64> = (0..n).map(|o| f64::from(out[o * rows + r])).collect();
+            let mut own: Vec<f64> = (0..n).map(|o| f64::from(out[o][r])).collect();
             let near = [-3e-7, 0.0, 3e-7].map(|by| f64::from(x) + by);
             let close = |a: f32, b: [f64; 3]| {
                 let low = b.into_iter().fold(f64::INFINITY, f64::min);
@@ -361,7 +369,7 @@ fn a_splines_derivatives_are_central_differences() {
                     (moved(1e-6) - moved(-1e-6)) / 2e-6
                 });
                 own[o] = value;
-                let ours = slope[o * rows + r];
+                let ours = slope[o][r];
                 assert!(
                     close(ours, numeric),
                     "{bins} bins at {x}, output {o}: {ours}, not {numeric:?}"
@@ -377,20 +385,22 @@ fn a_splines_derivatives_are_central_differences() {
 fn a_splines_samples_invert_its_distribution_function() {
     for (bins, gain) in [(2, 1.0), (8, 3.0), (16, 12.0)] {
         let spline = Spline { bins };
-        let (n, rows) = (spline.outputs(), 8);
+        let n = spline.outputs();
         let number = |u: &f32| gain * (2.0 * u - 1.0);
         let one: Vec<f32> = uniform(n, 22).iter().map(number).collect();
-        let out: Vec<f32> = one.iter().flat_map(|&o| vec![o; rows]).collect();
+        let out: Vec<Lanes> = one.iter().map(|&o| Lanes::all(o)).collect();
         let own: Vec<f64> = one.iter().map(|&o| f64::from(o)).collect();
-        let mut scratch = vec![0.0; spline.scratch() * rows];
+        let mut scratch = vec![Lanes::default(); spline.scratch()];
         let even: Vec<f32> = (0..400).map(|i| i as f32 / 400.0).collect();
-        let before = [&even[..], &[1.0 - f32::EPSILON / 2.0; 8]].concat();
+        let before = [&even[..], &[1.0 - f32::EPSILON / 2.0; ROWS]].concat();
         let (mut all, mut q) = (before.clone(), vec![0.0; before.len()]);
-        for (u, q) in all.chunks_exact_mut(rows).zip(q.chunks_exact_mut(rows)) {
-            spline.sample(rows, &out, u, q, &mut scratch);
-            let mut again = vec![0.0; rows];
-            spline.density(rows, &out, u, &mut again, &mut scratch);
-            for (a, b) in q.iter().zip(&again) {
+        for (u, q) in all.chunks_exact_mut(ROWS).zip(q.chunks_exact_mut(ROWS)) {
+            let mut x = lanes(u);
+            let density = spline.sample(Scalar, &out, &mut x, &mut scratch);
+            let again = spline.density(Scalar, &out, &x, &mut scratch);
+            u.copy_from_slice(&x.0);
+            q.copy_from_slice(&density.0);
+            for (a, b) in q.iter().zip(&again.0) {
                 assert!((a / b - 1.0).abs() < 1e-4, "{a} {b}");
             }
         }

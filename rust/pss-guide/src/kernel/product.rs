@@ -7,12 +7,14 @@
 
 use pulp::{Simd, WithSimd};
 
+use super::dispatch;
+
 /// A matrix seen through strides: element (i, j) is `values[i * row + j * column]`.
 #[derive(Clone, Copy)]
 pub(crate) struct Strided<'a> {
-    pub(super) values: &'a [f32],
-    pub(super) row: usize,
-    pub(super) column: usize,
+    pub(crate) values: &'a [f32],
+    pub(crate) row: usize,
+    pub(crate) column: usize,
 }
 
 impl<'a> Strided<'a> {
@@ -37,12 +39,7 @@ impl<'a> Strided<'a> {
 
 /// C (m, n) = A (m, k) · B (k, n), C row-major.
 pub(crate) fn multiply(c: &mut [f32], [m, k, n]: [usize; 3], a: Strided<'_>, b: Strided<'_>) {
-    let product = Product { c, m, k, n, a, b };
-    #[cfg(target_arch = "x86_64")]
-    if let Some(simd) = pulp::x86::V3::try_new() {
-        return Simd::vectorize(simd, product);
-    }
-    pulp::Arch::new().dispatch(product);
+    dispatch(Product { c, m, k, n, a, b });
 }
 
 struct Product<'a, 'c> {
@@ -59,30 +56,38 @@ impl WithSimd for Product<'_, '_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(mut self, simd: S) {
-        let mut panel = Vec::new();
+        let (mut panel, mut tile) = (Vec::new(), vec![0.0; 16 * S::F32_LANES]);
+        let (panel, tile) = (&mut panel, &mut tile);
         let mut first = 0;
         while first < self.n {
-            // 2 × 5 or 10 × 1 vectors of sums: both fit sixteen registers. 40 units are one panel of AVX.
-            if self.n - first > S::F32_LANES {
-                self.panel::<S, 2, 5>(simd, &mut panel, first);
-                first += 5 * S::F32_LANES;
-            } else {
-                self.panel::<S, 10, 1>(simd, &mut panel, first);
-                first += S::F32_LANES;
-            }
+            // Sums, the vectors of B and a number of A together fit 32 registers of AVX-512, and 16 elsewhere.
+            let vectors = (self.n - first).div_ceil(S::F32_LANES);
+            first += S::F32_LANES
+                * match (S::F32_LANES, vectors) {
+                    (16, 3..) => self.panel::<S, 5, 3>(simd, panel, tile, first),
+                    (16, 2) => self.panel::<S, 8, 2>(simd, panel, tile, first),
+                    (_, 2..) => self.panel::<S, 5, 2>(simd, panel, tile, first),
+                    _ => self.panel::<S, 10, 1>(simd, panel, tile, first),
+                };
         }
     }
 }
 
 impl Product<'_, '_> {
-    /// Columns `first ..` of C, V vectors of them, R rows at a time.
+    /// Columns `first ..` of C, V vectors of them, R rows at a time. Returns V.
     #[inline(always)]
+    #[allow(
+        clippy::needless_range_loop,
+        clippy::manual_memcpy,
+        reason = "indices are inlined wherever this is compiled, iterators only where the compiler likes"
+    )]
     fn panel<S: Simd, const R: usize, const V: usize>(
         &mut self,
         simd: S,
         panel: &mut Vec<f32>,
+        tile: &mut [f32],
         first: usize,
-    ) {
+    ) -> usize {
         let width = V * S::F32_LANES;
         let used = width.min(self.n - first);
         panel.clear();
@@ -99,38 +104,36 @@ impl Product<'_, '_> {
                     .for_each(|(to, &from)| *to = from);
             }
         }
-        let mut rows = vec![[0.0; R]; self.k];
         let (b, _) = pulp::as_arrays::<V, _>(S::as_simd_f32s(panel).0);
+        let b = &b[..self.k];
         for top in (0..self.m).step_by(R) {
             let mut sum = [[simd.splat_f32s(0.0); V]; R];
             // Rows beyond the last repeat it; their sums are not stored.
+            let mut rows = [self.a.values; R];
             for r in 0..R {
-                let start = (top + r).min(self.m - 1) * self.a.row;
-                let row = self.a.values[start..].iter().step_by(self.a.column);
-                rows.iter_mut()
-                    .zip(row)
-                    .for_each(|(to, &from)| to[r] = from);
+                rows[r] = &self.a.values[(top + r).min(self.m - 1) * self.a.row..];
             }
-            for (a, b) in rows.iter().zip(b) {
-                for (sum, &a) in sum.iter_mut().zip(a) {
-                    let a = simd.splat_f32s(a);
-                    for (sum, &b) in sum.iter_mut().zip(b) {
-                        *sum = simd.mul_add_e_f32s(a, b, *sum);
+            for i in 0..self.k {
+                let b = b[i];
+                for r in 0..R {
+                    // No check that may fail: with one the sums would have to be in memory.
+                    let a = rows[r].get(i * self.a.column).copied();
+                    let a = simd.splat_f32s(a.unwrap_or_default());
+                    for v in 0..V {
+                        sum[r][v] = simd.mul_add_e_f32s(a, b[v], sum[r][v]);
                     }
                 }
             }
-            for (r, sum) in sum.iter().enumerate().take(self.m - top) {
-                let c = &mut self.c[(top + r) * self.n + first..][..used];
-                let (whole, rest) = S::as_mut_simd_f32s(c);
-                let full = whole.len();
-                whole.copy_from_slice(&sum[..full]);
-                if let Some(last) = sum.get(full) {
-                    let last = [*last];
-                    let floats: &[f32] = pulp::bytemuck::cast_slice(&last);
-                    rest.copy_from_slice(&floats[..rest.len()]);
-                }
+            // By way of a buffer: sums that a variable picks would have to be in memory from the start.
+            let (stored, _) = pulp::as_arrays_mut::<V, _>(S::as_mut_simd_f32s(tile).0);
+            for r in 0..R {
+                stored[r] = sum[r];
+            }
+            for (r, row) in tile.chunks_exact(width).take(self.m - top).enumerate() {
+                self.c[(top + r) * self.n + first..][..used].copy_from_slice(&row[..used]);
             }
         }
+        V
     }
 }
 
