@@ -1,4 +1,4 @@
-"""Damaged guide files and wild options: a guide or an image, or one clear line; no crash, no hang.
+"""Damaged guide files and arrays and wild options: a guide or an image, or one clear line; no crash, no hang, no file left.
 
 Each case runs in a forked worker with a time limit, as those of `test_border.py` do. The long tier has 24,000.
 """
@@ -15,21 +15,28 @@ import pytest
 
 from tests.conftest import SCALAR
 from tests.support.border import Answer, Case
-from tests.support.guides import SMALL, guide_file, options, write_guides
+from tests.support.guides import SMALL, arrays, guide_file, options, write_guides
 from tests.support.workers import checked
 
 QUICK = 150
-ALL = 12_000
+ALL = 8_000
 SECONDS = 30.0
 
-KINDS: dict[str, Callable[..., Answer]] = {"guide files": guide_file, "options": options}
+KINDS: dict[str, Callable[..., Answer]] = {
+    "guide files": guide_file,
+    "options": options,
+    "arrays": arrays,
+}
 
 
 def _check(kind: str, seeds: range, folder: Path) -> Counter[str]:
     mi.set_variant(SCALAR)
     write_guides(folder)
+    files = sorted(folder.iterdir())
     cases = [Case(str(folder), seed) for seed in seeds]
-    return checked(kind, KINDS[kind], cases, seconds=SECONDS)
+    counts = checked(kind, KINDS[kind], cases, seconds=SECONDS)
+    assert sorted(folder.iterdir()) == files
+    return counts
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -43,10 +50,12 @@ def test_wild_guides_are_told_in_one_line(
     assert kind == "guide files" or counts["rendered"] > QUICK / 50
 
 
-def test_whole_guides_render(tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["guide files", "arrays"])
+def test_whole_inputs_render(kind: str, tmp_path: Path) -> None:
     """Or the damaged ones would be refused for a reason that is none of theirs."""
-    whole = range(-len(SMALL), 0)
-    assert _check("guide files", whole, tmp_path)["rendered"] == len(SMALL)
+    # Of arrays each guide is asked in three ways; which, the number decides.
+    whole = range(-4 * len(SMALL), 0)
+    assert _check(kind, whole, tmp_path)["rendered"] == len(whole)
 
 
 @pytest.mark.long

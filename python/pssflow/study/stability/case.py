@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -103,6 +103,8 @@ class Setting:
     """In place of the effort's."""
     side: int | None = None
     """In place of the effort's."""
+    seeds: int = 0
+    """At least so many, unless training is cheap."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +120,9 @@ class Case:
     settings: tuple[Setting, ...] = ()
     """Scenes to render with every guide."""
     probe: Callable[[str, Effort, Path], Finding | None] | None = None
-    """What no render of a scene can show: (guide, effort, a folder for files) → finding; None where it has no sense."""
+    """What no render of a scene can show: (guide, effort, a folder for files) → finding; None where it has no sense.
+    Comes on top of the settings.
+    """
 
 
 def render_options(
@@ -132,6 +136,11 @@ def render_options(
     return {"guide": guide, **options}
 
 
-def worst(findings: list[Finding]) -> Finding:
-    """The worst of several settings' findings, with the figures of all of them that are as bad."""
-    return max(findings, key=lambda found: VERDICTS.index(found.verdict))
+def worst(findings: Sequence[Finding]) -> Finding:
+    """The worst of several findings, by verdict and then by ratio, with the largest second moment of all of them."""
+    found = max(
+        findings, key=lambda f: (VERDICTS.index(f.verdict), f.numbers.get("ratio") or 0.0)
+    )
+    bound = max(findings, key=lambda f: f.numbers.get("bound") or 0.0)
+    moments = {name: bound.numbers.get(name) for name in ("bound", "bound_error")}
+    return replace(found, numbers={**found.numbers, **moments}) if moments["bound"] else found
