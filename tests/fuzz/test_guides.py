@@ -1,4 +1,4 @@
-"""Damaged guide files and arrays and wild options: a guide or an image, or one clear line; no crash, no hang, no file left.
+"""Damaged guide files, damaged arrays, wild options: an image, or one clear line; no crash, no hang, no file left.
 
 Each case runs in a forked worker with a time limit, as those of `test_border.py` do. The long tier has 24,000.
 """

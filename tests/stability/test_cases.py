@@ -23,6 +23,8 @@ from tests.conftest import SCALAR
 
 CHEAP_GUIDES = (THESIS, "realnvp-logit", "vegas", "table", "mixture-net", "auto")
 
+TRAINED = (THESIS, "realnvp", "realnvp-logit", "mixture-net", "spline-net")
+
 LONG = Effort(seeds=20, threads=1)
 
 BLIND = {"missed-mode", "moving-target"}
@@ -48,7 +50,6 @@ def _check(name: str, found: dict[str, Finding], record: dict[str, Any]) -> None
     ]
     if bounds:
         record["worst a·E[(f/m)²]/E[f²]"] = max(b for b in bounds if b is not None)
-    assert found, "no guide has anything to do with this case"
     for guide, finding in found.items():
         if guide == THESIS:
             continue
@@ -78,14 +79,17 @@ def test_guides_survive_a_planted_failure(
 
 @pytest.mark.long
 @pytest.mark.timeout(14400)
+@pytest.mark.parametrize(
+    "guides", [[g for g in STANDARD if g not in TRAINED], TRAINED], ids=["counted", "trained"]
+)
 @pytest.mark.parametrize("name", CASES)
 def test_guides_survive_all_of_a_planted_failure(
-    name: str, tmp_path: Path, record: dict[str, Any]
+    name: str, guides: Iterable[str], tmp_path: Path, record: dict[str, Any]
 ) -> None:
-    """All settings, twenty seeds, guides trained as they are by default. Where no pilot contains the failure, whoever loses
-    by it says so.
+    """All settings, twenty seeds, guides trained as they are by default. Where no pilot contains the failure, whoever
+    loses by it says so.
     """
-    found = _findings(CASES[name], STANDARD, LONG, tmp_path)
+    found = _findings(CASES[name], guides, LONG, tmp_path)
     _check(name, found, record)
     for guide, finding in found.items():
         if name in BLIND and guide != THESIS and finding.verdict == "degrades":

@@ -168,7 +168,7 @@ def _surgeon(rng: random.Random, wounds: int) -> Wound:
         arrays = dict(arrays)
         for _ in range(wounds):
             which = rng.choice(sorted(arrays))
-            arrays[which] = _wounded(np.array(arrays[which]), rng)
+            arrays[which] = _wounded(np.atleast_1d(arrays[which]), rng)
         return arrays
 
     return wound
@@ -178,7 +178,7 @@ def _wounded(array: NDArray[Any], rng: random.Random) -> Any:
     """Other values, another length, width, type or layout."""
     kind = rng.randrange(9)
     if kind < 3 and array.size and array.dtype.kind == "f":
-        flat = array.ravel()
+        flat = array.flatten()
         # A row, a stretch, or most of it.
         start, length = rng.randrange(flat.size), rng.choice([1, 7, flat.size])
         flat[start : start + length] = rng.choice(VALUES)
@@ -192,7 +192,17 @@ def _wounded(array: NDArray[Any], rng: random.Random) -> Any:
     if kind == 6:
         return rng.choice([array.ravel(), array[None], array[..., None], np.float32(0.5)])
     if kind == 7:
-        types = ["float64", "int32", "uint8", "bool", ">f4", "float16", "complex64", "str", "object"]
+        types = [
+            "float64",
+            "int32",
+            "uint8",
+            "bool",
+            ">f4",
+            "float16",
+            "complex64",
+            "str",
+            "object",
+        ]
         return array.astype(rng.choice(types))
     return rng.choice([array[::-1], np.asfortranarray(array), np.repeat(array, 2, axis=0)[::2]])
 
@@ -207,8 +217,19 @@ def _trace(name: str, folder: Path, wound: Wound) -> None:
 
 def _teach(name: str, folder: Path, wound: Wound) -> None:
     pilot = _scene().pilot(spp=4, seed=1)
-    given = ("u", "f", "f_bsdf", "g", "position", "normal", "outgoing", "pixel", "emitter", "emitters")
-    changed = wound({field: getattr(pilot, field) for field in given})
+    given = (
+        "u",
+        "f",
+        "f_bsdf",
+        "g",
+        "position",
+        "normal",
+        "outgoing",
+        "pixel",
+        "emitter",
+        "emitters",
+    )
+    changed: Any = wound({field: getattr(pilot, field) for field in given})
     guide = replace(pilot, **changed).fit(name, **SMALL[name])
     _check(_scene().render(guide, 1, seed=1, threads=1, progress=False))
 

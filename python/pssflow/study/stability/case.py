@@ -138,9 +138,7 @@ def render_options(
 
 def worst(findings: Sequence[Finding]) -> Finding:
     """The worst of several findings, by verdict and then by ratio, with the largest second moment of all of them."""
-    found = max(
-        findings, key=lambda f: (VERDICTS.index(f.verdict), f.numbers.get("ratio") or 0.0)
-    )
+    found = max(findings, key=lambda f: (VERDICTS.index(f.verdict), f.numbers.get("ratio") or 0.0))
     bound = max(findings, key=lambda f: f.numbers.get("bound") or 0.0)
     moments = {name: bound.numbers.get(name) for name in ("bound", "bound_error")}
     return replace(found, numbers={**found.numbers, **moments}) if moments["bound"] else found

@@ -74,8 +74,8 @@ def stability(
     from ...output import make_folder
     from ..store import configuration
     from .case import QUICK, THESIS, Effort
-    from .registry import CASES, STANDARD
     from .measure import measure
+    from .registry import CASES, STANDARD
     from .results import Row, Rows, fill_page, publish
 
     terminal.quiet = quiet

@@ -181,7 +181,6 @@ def _dimmed(pilot: Pilot, rng: np.random.Generator, *, count: int) -> Pilot:
     return replace(pilot, f=f, f_bsdf=f_bsdf)
 
 
-
 FEW = Case(
     5,
     "few-paths",

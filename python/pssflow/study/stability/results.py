@@ -224,8 +224,8 @@ MARKS = ("<!-- pssflow study stability -->", "<!-- end -->")
 
 CAPTION = (
     "Numbers are relMSE ÷ that of as many random samples: medians over seeds; means, with their standard errors, for "
-    "thesis and in cases 3 and 15, where a few paths decide. Holds: finite, unbiased, no weight above 1/a, at most 1.3. "
-    "Degrades: safe, but slower. Fails: biased, unbounded, not finite, or more than ten times slower at a = 0. "
+    "thesis and in cases 3 and 15, where a few paths decide. Holds: finite, unbiased, no weight above 1/a, at most "
+    "1.3. Degrades: safe, but slower. Fails: biased, unbounded, not finite, or more than ten times slower at a = 0. "
     "thesis: a = 0; all others with the guide's own share a of random numbers."
 )
 
