@@ -11,8 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
+import numpy as np
 import pytest
 
+from pssflow.guide import Guide
 from tests.conftest import SCALAR
 from tests.support.border import Answer, Case
 from tests.support.guides import SMALL, arrays, guide_file, options, write_guides
@@ -56,6 +58,22 @@ def test_whole_inputs_render(kind: str, tmp_path: Path) -> None:
     # Of arrays each guide is asked in three ways; which, the number decides.
     whole = range(-4 * len(SMALL), 0)
     assert _check(kind, whole, tmp_path)["rendered"] == len(whole)
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_numbers_outside_the_cube_have_no_density(name: str, tmp_path: Path) -> None:
+    """Only the thesis' flow has mass there; no guide answers with what is no number."""
+    mi.set_variant(SCALAR)
+    write_guides(tmp_path)
+    guide = Guide.load(tmp_path / f"{name}.guide")
+    places = {key: np.zeros((5, 3), np.float32) for key in ("position", "normal", "outgoing")}
+    for decision in guide.models:
+        width = {"path": guide.dims, "emitter": 1}.get(decision, 2)
+        u = np.full((5, width), 0.5, np.float32)
+        u[:, -1] = [1.0, -1e-6, np.inf, -np.inf, np.nan]
+        density = guide.log_prob(u, decision=decision, contexts=places)
+        assert not np.isnan(density).any(), decision
+        assert name == "realnvp" or (density == -np.inf).all(), decision
 
 
 @pytest.mark.long

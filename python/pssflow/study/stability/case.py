@@ -123,6 +123,8 @@ class Case:
     """What no render of a scene can show: (guide, effort, a folder for files) → finding; None where it has no sense.
     Comes on top of the settings.
     """
+    picture: bool = False
+    """Whether docs/limits.md shows its first setting."""
 
 
 def render_options(

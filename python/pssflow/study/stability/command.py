@@ -133,7 +133,7 @@ def stability(
         fill_page(Path(page), rows, names, titles, heading)
         strips = make_folder(Path(page).with_suffix(""))
         for case in chosen:
-            if case.settings:
+            if case.picture:
                 terminal.say(f"picture of {case.number} {case.name}")
                 _strip(strips / f"{case.name}.png", case, titles[case.name], names, effort)
 

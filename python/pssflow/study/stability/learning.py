@@ -38,6 +38,7 @@ PRIOR = Case(
             guide_options={name: {"prior": "hypercube"} for name in FLOWS},
         ),
     ),
+    picture=True,
 )
 
 

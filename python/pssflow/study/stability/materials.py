@@ -59,6 +59,7 @@ GLOSSY = Case(
         Setting("α = .01", _glossy(0.01)),
         Setting("masks", _masked),
     ),
+    picture=True,
 )
 
 
