@@ -466,7 +466,9 @@ def _of_paths(contexts: Mapping[str, ArrayLike], n: int) -> dict[str, NDArray[An
             "`contexts` holds no `position`, (n, k, 3), which tells how many vertices there are"
         )
     vertices = ("position", "normal", "outgoing")
-    arrays = {name: np.asarray(contexts[name], np.float32) for name in vertices if name in contexts}
+    arrays: dict[str, NDArray[Any]] = {
+        name: np.asarray(contexts[name], np.float32) for name in vertices if name in contexts
+    }
     if "pixel" in contexts:
         arrays["pixel"] = np.asarray(contexts["pixel"], np.float32)
     if "emitter" in contexts:

@@ -32,6 +32,8 @@ OTHERS = ("", "abc", "1", None, True, [], {}, [1, 2])
 VALUES = (np.nan, np.inf, -np.inf, 1e38, -1e38, 1e-42, -1.0, 0.0, 1.0, 0.5, 2.0**24, 1 - 2.0**-24)
 """What numbers of arrays become."""
 
+TYPES = ("float64", "int32", "uint8", "bool", ">f4", "float16", "complex64", "str", "object")
+
 _SCENES: dict[str, pssflow.Scene] = {}
 
 
@@ -192,18 +194,7 @@ def _wounded(array: NDArray[Any], rng: random.Random) -> Any:
     if kind == 6:
         return rng.choice([array.ravel(), array[None], array[..., None], np.float32(0.5)])
     if kind == 7:
-        types = [
-            "float64",
-            "int32",
-            "uint8",
-            "bool",
-            ">f4",
-            "float16",
-            "complex64",
-            "str",
-            "object",
-        ]
-        return array.astype(rng.choice(types))
+        return array.astype(rng.choice(TYPES))
     return rng.choice([array[::-1], np.asfortranarray(array), np.repeat(array, 2, axis=0)[::2]])
 
 
@@ -239,12 +230,13 @@ def _ask(name: str, folder: Path, wound: Wound) -> None:
     decision = guide.models[0]
     rng = np.random.default_rng(4)
     width = {"path": guide.dims, "emitter": 1}.get(decision, 2)
+    up = np.tile(np.array([0, 0, 1], np.float32), (32, 1))
     changed = wound(
         {
             "u": rng.random((32, width), np.float32),
             "position": rng.uniform(-1, 1, (32, 3)).astype(np.float32),
-            "normal": np.tile(np.float32([0, 0, 1]), (32, 1)),
-            "outgoing": np.tile(np.float32([0, 0, 1]), (32, 1)),
+            "normal": up,
+            "outgoing": up,
             "pixel": rng.random((32, 2), np.float32),
             "emitter": np.zeros(32, np.uint32),
             "bounce": np.ones(32, np.uint32),

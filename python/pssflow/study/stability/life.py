@@ -33,9 +33,9 @@ PATIENCE = 600.0
 def _files(guide: str, effort: Effort, folder: Path) -> Finding | None:
     """Interrupts a render, cuts a guide's file, and fills the disk while it is written."""
     how = render_options(guide, effort) | {"threads": effort.threads, "progress": False}
+    interrupted = Scene(room(256))
     try:
         # So long that it cannot be over before it is asked for its progress.
-        interrupted = Scene(room(256))
         interrupted.render(**{**how, "progress": _interrupt}, spp=1024)
         return Finding("fails", "an interrupt was ignored")
     except KeyboardInterrupt:
