@@ -116,7 +116,7 @@ results: build $(VENV)/.studies ## docs/results.md and its CSV from a study of o
 
 .PHONY: study-stability
 study-stability: build ## planted failures with every guide: what holds, degrades or fails; out/study-stability; resumes
-	$(BIN)/python -m pssflow study stability --page docs/limits.md -o out/study-stability
+	$(BIN)/python -m pssflow study stability -o out/study-stability
 
 .PHONY: docs
 docs: build $(VENV)/.docs ## Rust API into target/doc, Python API into out/docs
