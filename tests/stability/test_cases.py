@@ -58,9 +58,10 @@ def _check(name: str, found: dict[str, Finding], record: dict[str, Any]) -> None
             assert np.isfinite(finding.image).all()
     auto = found.get("auto")
     if auto is not None and name not in BLIND and "ratio" in auto.numbers:
-        ratio = auto.numbers["ratio"]
+        ratio, error = auto.numbers["ratio"], auto.numbers["ratio_error"]
         assert ratio is not None
-        assert ratio <= HARMLESS, f"auto: {auto.figure}; {auto.why}"
+        assert error is not None
+        assert ratio - 2 * error <= HARMLESS, f"auto: {auto.figure}; {auto.why}"
 
 
 def test_all_cases_are_there() -> None:

@@ -139,8 +139,13 @@ def render_options(
 
 
 def worst(findings: Sequence[Finding]) -> Finding:
-    """The worst of several findings, by verdict and then by ratio, with the largest second moment of all of them."""
-    found = max(findings, key=lambda f: (VERDICTS.index(f.verdict), f.numbers.get("ratio") or 0.0))
+    """The worst of several findings, by verdict and then by the ratio that is sure, with the largest second moment."""
+
+    def badness(found: Finding) -> tuple[int, float]:
+        ratio, error = (found.numbers.get(name) or 0.0 for name in ("ratio", "ratio_error"))
+        return VERDICTS.index(found.verdict), ratio - 2 * error
+
+    found = max(findings, key=badness)
     bound = max(findings, key=lambda f: f.numbers.get("bound") or 0.0)
     moments = {name: bound.numbers.get(name) for name in ("bound", "bound_error")}
     return replace(found, numbers={**found.numbers, **moments}) if moments["bound"] else found

@@ -51,7 +51,7 @@ class Row:
     ratio: str
     """relMSE ÷ that of random numbers at equal samples: medians over seeds, or means (`measure`)."""
     ratio_error: str
-    """Standard error of a ratio of means."""
+    """Its standard error."""
     bound: str
     """a · E[(f/m)²] ÷ E[f²]."""
     bound_error: str
@@ -223,7 +223,7 @@ MARKS = ("<!-- pssflow study stability -->", "<!-- end -->")
 """Lines of a page between which the table is put."""
 
 CAPTION = (
-    "Numbers are relMSE ÷ that of as many random samples: medians over seeds; means, with their standard errors, for "
+    "Numbers are relMSE ÷ that of as many random samples: medians over seeds, with their standard errors; means for "
     "thesis and in cases 3 and 15, where a few paths decide. Holds: finite, unbiased, no weight above 1/a, at most "
     "1.3. Degrades: safe, but slower. Fails: biased, unbounded, not finite, or more than ten times slower at a = 0. "
     "thesis: a = 0; all others with the guide's own share a of random numbers."
