@@ -19,6 +19,7 @@ __all__ = [
     "Finding",
     "Setting",
     "render_options",
+    "sure",
     "worst",
 ]
 
@@ -138,14 +139,18 @@ def render_options(
     return {"guide": guide, **options}
 
 
+def sure(numbers: Mapping[str, float | None], name: str) -> float:
+    """A number less two of its standard errors; 0 where there is none."""
+    return (numbers.get(name) or 0.0) - 2 * (numbers.get(f"{name}_error") or 0.0)
+
+
 def worst(findings: Sequence[Finding]) -> Finding:
-    """The worst of several findings, by verdict and then by the ratio that is sure, with the largest second moment."""
+    """The worst of several findings, by verdict, then by ratio, with the largest second moment, both as far as sure."""
 
     def badness(found: Finding) -> tuple[int, float]:
-        ratio, error = (found.numbers.get(name) or 0.0 for name in ("ratio", "ratio_error"))
-        return VERDICTS.index(found.verdict), ratio - 2 * error
+        return VERDICTS.index(found.verdict), sure(found.numbers, "ratio")
 
     found = max(findings, key=badness)
-    bound = max(findings, key=lambda f: f.numbers.get("bound") or 0.0)
+    bound = max(findings, key=lambda f: sure(f.numbers, "bound"))
     moments = {name: bound.numbers.get(name) for name in ("bound", "bound_error")}
     return replace(found, numbers={**found.numbers, **moments}) if moments["bound"] else found
