@@ -279,7 +279,7 @@ fn the_reported_density_is_that_of_the_returned_numbers() {
 /// it draws is the density of the f64 twin, all but a thousandth of them within a tenth.
 #[test]
 fn after_aggressive_training_f32_still_states_the_density_of_the_f64_twin() {
-    let mut survived = 0;
+    let mut compared = 0;
     for (domain, prior) in [
         (Domain::Cube, "gaussian"),
         (Domain::Logit, "gaussian"),
@@ -296,7 +296,6 @@ fn after_aggressive_training_f32_still_states_the_density_of_the_f64_twin() {
         let Ok(trained) = train::train(domain, &options, start, &x, 5, &mut |_| true) else {
             continue;
         };
-        survived += 1;
         let exact = Twin::from(&trained.weights);
         let flow = RealNvp::new(domain, options, trained.weights);
         let rows = 2000;
@@ -320,6 +319,7 @@ fn after_aggressive_training_f32_still_states_the_density_of_the_f64_twin() {
             let want = twin::log_density(&exact, flow.options.s_max, flow.options.prior, &x);
             errors.push((f64::from(q).ln() - want - jacobian).abs());
         }
+        compared += errors.len();
         errors.sort_unstable_by(f64::total_cmp);
         if let Some(worst) = errors.get((errors.len() * 999 / 1000).saturating_sub(1)) {
             assert!(
@@ -329,7 +329,7 @@ fn after_aggressive_training_f32_still_states_the_density_of_the_f64_twin() {
             );
         }
     }
-    assert!(survived > 0, "all trainings diverged: nothing was compared");
+    assert!(compared > 1000, "{compared} numbers inside the cube");
 }
 
 #[test]
