@@ -106,6 +106,8 @@ class Setting:
     """In place of the effort's."""
     seeds: int = 0
     """At least so many, unless training is cheap."""
+    refused: str = ""
+    """What the line holds by which a guide may refuse this; empty: it must not."""
 
 
 @dataclass(frozen=True)
