@@ -173,6 +173,8 @@ class Guide:
         last = None if ray is None else _rows(ray)
         if last is not None and last.shape != (len(u), 2):
             raise ValueError(f"`ray` has shape {last.shape}; expected ({len(u)}, 2)")
+        if contexts is not None:
+            contexts = _of_paths(contexts, len(u))
         pixel = None if contexts is None else contexts.get("pixel")
         core = _core.Guide.fit(
             name,
@@ -184,9 +186,7 @@ class Guide:
             g=np.ascontiguousarray(density[lit]),
             contexts=None if contexts is None else _vertices(contexts, lit),
             pixel=None if pixel is None else _rows(np.asarray(pixel)[lit]),
-            emitters=[]
-            if emitters is None
-            else [(float(e), bool(s)) for e, s in np.asarray(emitters)],
+            emitters=[] if emitters is None else _intervals(emitters),
             zeros=check_integer("zeros", zeros, 0, 2**63) + int(np.count_nonzero(~lit)),
             options=options_json(_by_part(name, options)),
             seed=check_integer("seed", seed, 0, MAX_SEED),
@@ -444,25 +444,62 @@ def _by_part(guide: str, options: Mapping[str, Any]) -> dict[str, Any]:
     return by_part[parts[0]] if len(parts) == 1 else by_part
 
 
+def _intervals(emitters: ArrayLike) -> list[tuple[float, bool]]:
+    array = np.asarray(emitters, np.float32)
+    if array.ndim != 2 or array.shape[1] != 2:
+        raise ValueError(f"`emitters` has shape {array.shape}; expected (m, 2)")
+    return [(float(end), bool(surrounds)) for end, surrounds in array]
+
+
 def _luminance(values: F32) -> F32:
     return values @ LUMINANCE if values.ndim == 2 else values
 
 
-def _vertices(contexts: Mapping[str, ArrayLike], rows: NDArray[np.bool_]) -> dict[str, Any]:
+def _of_paths(contexts: Mapping[str, ArrayLike], n: int) -> dict[str, NDArray[Any]]:
+    """Contexts of n whole paths as arrays.
+
+    Raises:
+        ValueError: one is missing that tells the number of vertices, or has another shape.
+    """
+    if "position" not in contexts:
+        raise ValueError(
+            "`contexts` holds no `position`, (n, k, 3), which tells how many vertices there are"
+        )
+    vertices = ("position", "normal", "outgoing")
+    arrays: dict[str, NDArray[Any]] = {
+        name: np.asarray(contexts[name], np.float32) for name in vertices if name in contexts
+    }
+    if "pixel" in contexts:
+        arrays["pixel"] = np.asarray(contexts["pixel"], np.float32)
+    if "emitter" in contexts:
+        emitter = np.asarray(contexts["emitter"])
+        if emitter.dtype.kind not in "iu":
+            raise ValueError(f"contexts['emitter'] holds {emitter.dtype}; expected integers")
+        arrays["emitter"] = emitter.astype(np.uint32)
+    k = arrays["position"].shape[1] if arrays["position"].ndim == 3 else 0
+    expected = {**dict.fromkeys(vertices, (n, k, 3)), "pixel": (n, 2), "emitter": (n,)}
+    for name, array in arrays.items():
+        if k == 0 or array.shape != expected[name]:
+            shape = str(expected[name]) if k else f"({n}, k, 3), k ≥ 1"
+            raise ValueError(f"contexts[{name!r}] has shape {array.shape}; expected {shape}")
+    return arrays
+
+
+def _vertices(contexts: Mapping[str, NDArray[Any]], rows: NDArray[np.bool_]) -> dict[str, Any]:
     """Contexts of whole paths, (n, k, …), as one row a vertex; the emitter belongs to the last one."""
-    position = np.asarray(contexts["position"], np.float32)[rows]
-    n, k = position.shape[:2]
+    k = contexts["position"].shape[1]
+    n = int(np.count_nonzero(rows))
     flat: dict[str, Any] = {
-        name: np.asarray(contexts[name], np.float32)[rows].reshape(n * k, 3)
+        name: contexts[name][rows].reshape(n * k, 3)
         for name in ("position", "normal", "outgoing")
         if name in contexts
     }
     flat["bounce"] = np.tile(np.arange(1, k + 1, dtype=np.uint32), n)
     if "pixel" in contexts:
-        flat["pixel"] = np.repeat(np.asarray(contexts["pixel"], np.float32)[rows], k, axis=0)
+        flat["pixel"] = np.repeat(contexts["pixel"][rows], k, axis=0)
     if "emitter" in contexts:
         emitter = np.zeros((n, k), np.uint32)
-        emitter[:, -1] = np.asarray(contexts["emitter"])[rows]
+        emitter[:, -1] = contexts["emitter"][rows]
         flat["emitter"] = emitter.ravel()
     return flat
 

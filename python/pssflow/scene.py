@@ -135,12 +135,13 @@ class Pilot(Trace):
         """Fits a guide to these paths; see `Guide.fit`."""
         from .guide import Guide
 
+        u = _matrix(self.u, "u")
         return Guide.fit(
             name,
-            self.u[:, : self.learned],
+            u[:, : self.learned],
             self.f,
             f_bsdf=self.f_bsdf,
-            ray=self.u[:, self.learned :] if self.u.shape[1] > self.learned else None,
+            ray=u[:, self.learned :] if u.shape[1] > self.learned else None,
             g=self.g,
             contexts={
                 name: getattr(self, name)

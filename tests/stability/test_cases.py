@@ -14,14 +14,16 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from pssflow.study.stability.case import QUICK, THESIS, Case, Effort, Finding, Setting
+from pssflow.study.stability.case import QUICK, THESIS, Case, Effort, Finding, Setting, sure
 from pssflow.study.stability.life import MEMORY
-from pssflow.study.stability.measure import HARMLESS, Bench, judge, measure
+from pssflow.study.stability.measure import HARMLESS, TELLING, Bench, judge, measure
 from pssflow.study.stability.parts import room
 from pssflow.study.stability.registry import CASES, STANDARD
 from tests.conftest import SCALAR
 
 CHEAP_GUIDES = (THESIS, "realnvp-logit", "vegas", "table", "mixture-net", "auto")
+
+TRAINED = (THESIS, "realnvp", "realnvp-logit", "mixture-net", "spline-net")
 
 LONG = Effort(seeds=20, threads=1)
 
@@ -34,27 +36,20 @@ def _findings(
 ) -> dict[str, Finding]:
     mi.set_variant(SCALAR)
     benches: dict[str, Bench] = {}
-    found: dict[str, Finding] = {}
-    for guide in guides:
-        if case.settings:
-            found[guide] = measure(case, guide, effort, benches)
-        elif case.probe is not None and (finding := case.probe(guide, effort, folder)) is not None:
-            found[guide] = finding
-    return found
+    found = {guide: measure(case, guide, effort, benches, folder) for guide in guides}
+    return {guide: finding for guide, finding in found.items() if finding is not None}
 
 
 def _check(name: str, found: dict[str, Finding], record: dict[str, Any]) -> None:
     """What must hold of each guide; what it came to is recorded either way."""
     for guide, finding in found.items():
-        for number, value in finding.numbers.items():
-            record[f"{guide} {number}"] = value
+        record |= {f"{guide} {number}": value for number, value in finding.numbers.items()}
         record[f"{guide} verdict"] = f"{finding.verdict}: {finding.figure}"
     bounds = [
         f.numbers["bound"] for g, f in found.items() if g != THESIS and f.numbers.get("bound")
     ]
     if bounds:
         record["worst a·E[(f/m)²]/E[f²]"] = max(b for b in bounds if b is not None)
-    assert found, "no guide has anything to do with this case"
     for guide, finding in found.items():
         if guide == THESIS:
             continue
@@ -63,9 +58,7 @@ def _check(name: str, found: dict[str, Finding], record: dict[str, Any]) -> None
             assert np.isfinite(finding.image).all()
     auto = found.get("auto")
     if auto is not None and name not in BLIND and "ratio" in auto.numbers:
-        ratio = auto.numbers["ratio"]
-        assert ratio is not None
-        assert ratio <= HARMLESS, f"auto: {auto.figure}; {auto.why}"
+        assert sure(auto.numbers, "ratio") <= HARMLESS, f"auto: {auto.figure}; {auto.why}"
 
 
 def test_all_cases_are_there() -> None:
@@ -84,12 +77,22 @@ def test_guides_survive_a_planted_failure(
 
 @pytest.mark.long
 @pytest.mark.timeout(14400)
+@pytest.mark.parametrize(
+    "guides", [[g for g in STANDARD if g not in TRAINED], TRAINED], ids=["counted", "trained"]
+)
 @pytest.mark.parametrize("name", CASES)
 def test_guides_survive_all_of_a_planted_failure(
-    name: str, tmp_path: Path, record: dict[str, Any]
+    name: str, guides: Iterable[str], tmp_path: Path, record: dict[str, Any]
 ) -> None:
-    """All settings, twenty seeds, guides trained as they are by default."""
-    _check(name, _findings(CASES[name], STANDARD, LONG, tmp_path), record)
+    """All settings, twenty seeds, guides trained as they are by default. Where no pilot contains the failure, whoever
+    loses by it says so.
+    """
+    found = _findings(CASES[name], guides, LONG, tmp_path)
+    _check(name, found, record)
+    for guide, finding in found.items():
+        if name in BLIND and guide != THESIS and finding.verdict == "degrades":
+            warned = finding.numbers["warned"] or 0.0
+            assert warned >= TELLING, f"{guide}: {finding.figure}; {finding.why}"
 
 
 @pytest.mark.timeout(600)
@@ -99,7 +102,7 @@ def test_a_mode_that_the_pilot_missed_is_told(record: dict[str, Any]) -> None:
     found = _findings(CASES["missed-mode"], ("table", "mixture-net", "auto"), effort, Path())
     for guide, finding in found.items():
         record[f"{guide} warned"] = finding.numbers["warned"] or 0.0
-        assert (finding.numbers["warned"] or 0.0) >= 0.5, f"{guide}: {finding.figure}"
+        assert (finding.numbers["warned"] or 0.0) >= TELLING, f"{guide}: {finding.figure}"
 
 
 @pytest.mark.timeout(600)

@@ -116,8 +116,12 @@ def test_the_study_resumes(tmp_path: Path, capfd: pytest.CaptureFixture[str]) ->
     assert run_command(commands, [*command, "--guides", "vegas", "-o", str(folder)]) == 0
     first = (folder / "results.csv").read_text(encoding="utf-8").splitlines()
     capfd.readouterr()
-    assert run_command(commands, [*command, "--guides", "vegas,auto", "-o", str(folder)]) == 0
+    page = tmp_path / "page.md"
+    more = [*command, "--guides", "vegas,auto", "-o", str(folder), "--page", str(page)]
+    page.write_text("# Limits\n", encoding="utf-8")
+    assert run_command(commands, more) == 2
     said = capfd.readouterr().err
+    assert "page.md: has no lines <!-- pssflow study stability -->" in said
     assert "easy-scene, auto" in said
     assert "easy-scene, vegas" not in said
     second = (folder / "results.csv").read_text(encoding="utf-8").splitlines()
@@ -126,3 +130,14 @@ def test_the_study_resumes(tmp_path: Path, capfd: pytest.CaptureFixture[str]) ->
     names = {path.name for path in folder.iterdir()}
     assert names == {"results.csv", "summary.md", "stability.png", "stability.svg"}
     assert "| 14. An easy scene | vegas |" in (folder / "summary.md").read_text(encoding="utf-8")
+    # What was written by hand stays, and what stood between the marks does not.
+    hand = "# Limits\n\n<!-- pssflow study stability -->{}<!-- end -->\n\nIn plain words.\n"
+    page.write_text(hand.format("\nstale\n"), encoding="utf-8")
+    assert run_command(commands, more) == 0
+    filled = page.read_text(encoding="utf-8")
+    start, end = hand.split("{}")
+    assert filled.startswith(start)
+    assert filled.endswith(end)
+    assert "| case | vegas | auto |" in filled
+    assert "stale" not in filled
+    assert [p.name for p in (tmp_path / "page").iterdir()] == ["easy-scene.png"]

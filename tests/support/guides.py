@@ -1,15 +1,18 @@
-"""Guide files and options of renders, damaged at random: the cases that forked workers run."""
+"""Guide files, options of renders and arrays, damaged at random: the cases that forked workers run."""
 
 from __future__ import annotations
 
 import random
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 import pssflow
-from pssflow.guide import registry
+from pssflow.guide import Guide, registry
 from pssflow.study.stability.parts import room
 from tests.support.border import Answer, Case, Report, judge
 
@@ -25,6 +28,11 @@ SMALL: dict[str, dict[str, Any]] = {
 
 NUMBERS = (0, 1, -1, 2, 3, 7, 0.5, 1e-9, 1e9, 1e300, -0.0, float("nan"), float("inf"), 2**31, 2**70)
 OTHERS = ("", "abc", "1", None, True, [], {}, [1, 2])
+
+VALUES = (np.nan, np.inf, -np.inf, 1e38, -1e38, 1e-42, -1.0, 0.0, 1.0, 0.5, 2.0**24, 1 - 2.0**-24)
+"""What numbers of arrays become."""
+
+TYPES = ("float64", "int32", "uint8", "bool", ">f4", "float16", "complex64", "str", "object")
 
 _SCENES: dict[str, pssflow.Scene] = {}
 
@@ -46,7 +54,7 @@ def write_guides(folder: Path) -> None:
 def guide_file(case: Case, report: Report) -> Answer:
     """Loads a guide's file with a few bytes changed, moved, added or lost, and renders with what was taken."""
     rng = random.Random(case.seed)
-    name = sorted(SMALL)[case.seed % len(SMALL)]
+    name = _of_seed(case)
     whole = (Path(case.folder) / f"{name}.guide").read_bytes()
     path = Path(case.folder) / f"case-{case.seed}.guide"
     path.write_bytes(whole if case.seed < 0 else _damaged(whole, rng))
@@ -60,6 +68,11 @@ def guide_file(case: Case, report: Report) -> Answer:
         return judge(render)
     finally:
         path.unlink(missing_ok=True)
+
+
+def _of_seed(case: Case) -> str:
+    """Guides take turns."""
+    return sorted(SMALL)[case.seed % len(SMALL)]
 
 
 def _damaged(whole: bytes, rng: random.Random) -> bytes:
@@ -130,6 +143,114 @@ def options(case: Case, report: Report) -> Answer:
         _check(result)
 
     return judge(render)
+
+
+def arrays(case: Case, report: Report) -> Answer:
+    """Traces damaged numbers, asks a guide about damaged numbers and places, or renders with one that was fitted to a
+    damaged pilot.
+    """
+    rng = random.Random(case.seed)
+    name = _of_seed(case)
+    asked = rng.choice([_trace, _teach, _ask])
+    wounds = 0 if case.seed < 0 else rng.choice([1, 1, 1, 2])
+
+    def render() -> None:
+        report(f"pssflow {asked.__name__} {name}")
+        asked(name, Path(case.folder), _surgeon(rng, wounds))
+
+    return judge(render)
+
+
+Wound = Callable[[dict[str, Any]], dict[str, Any]]
+"""Arrays by name → the same, some of them damaged."""
+
+
+def _surgeon(rng: random.Random, wounds: int) -> Wound:
+    def wound(arrays: dict[str, Any]) -> dict[str, Any]:
+        arrays = dict(arrays)
+        for _ in range(wounds):
+            which = rng.choice(sorted(arrays))
+            arrays[which] = _wounded(np.atleast_1d(arrays[which]), rng)
+        return arrays
+
+    return wound
+
+
+def _wounded(array: NDArray[Any], rng: random.Random) -> Any:
+    """Other values, another length, width, type or layout."""
+    kind = rng.randrange(9)
+    if kind < 3 and array.size and array.dtype.kind == "f":
+        flat = array.flatten()
+        # A row, a stretch, or most of it.
+        start, length = rng.randrange(flat.size), rng.choice([1, 7, flat.size])
+        flat[start : start + length] = rng.choice(VALUES)
+        return flat.reshape(array.shape)
+    if kind == 3:
+        return array[: rng.choice([0, 1, max(len(array) - 1, 0)])]
+    if kind == 4:
+        return np.concatenate([array, array[: rng.choice([1, 5])]])
+    if kind == 5 and array.ndim > 1:
+        return array[..., : rng.choice([0, 1, array.shape[-1] - 1])]
+    if kind == 6:
+        return rng.choice([array.ravel(), array[None], array[..., None], np.float32(0.5)])
+    if kind == 7:
+        return array.astype(rng.choice(TYPES))
+    return rng.choice([array[::-1], np.asfortranarray(array), np.repeat(array, 2, axis=0)[::2]])
+
+
+def _trace(name: str, folder: Path, wound: Wound) -> None:
+    rng = np.random.default_rng(3)
+    u, pixels = rng.random((64, 7), np.float32), 6 * rng.random((64, 2), np.float32)
+    traced = _scene().trace(**wound({"u": u, "pixels": pixels}), threads=1)
+    if not np.isfinite(traced.f).all():
+        raise AssertionError("what was traced is not finite")
+
+
+def _teach(name: str, folder: Path, wound: Wound) -> None:
+    pilot = _scene().pilot(spp=4, seed=1)
+    given = (
+        "u",
+        "f",
+        "f_bsdf",
+        "g",
+        "position",
+        "normal",
+        "outgoing",
+        "pixel",
+        "emitter",
+        "emitters",
+    )
+    changed: Any = wound({field: getattr(pilot, field) for field in given})
+    guide = replace(pilot, **changed).fit(name, **SMALL[name])
+    _check(_scene().render(guide, 1, seed=1, threads=1, progress=False))
+
+
+def _ask(name: str, folder: Path, wound: Wound) -> None:
+    guide = Guide.load(folder / f"{name}.guide")
+    decision = guide.models[0]
+    rng = np.random.default_rng(4)
+    width = {"path": guide.dims, "emitter": 1}.get(decision, 2)
+    up = np.tile(np.array([0, 0, 1], np.float32), (32, 1))
+    changed = wound(
+        {
+            "u": rng.random((32, width), np.float32),
+            "position": rng.uniform(-1, 1, (32, 3)).astype(np.float32),
+            "normal": up,
+            "outgoing": up,
+            "pixel": rng.random((32, 2), np.float32),
+            "emitter": np.zeros(32, np.uint32),
+            "bounce": np.ones(32, np.uint32),
+        }
+    )
+    u = changed.pop("u")
+    density = guide.log_prob(u, decision=decision, contexts=changed)
+    drawn, again = guide.sample(32, 5, decision=decision, contexts=changed)
+    for values in (density, again):
+        # A density of zero is legal; no number is not.
+        if np.isnan(values).any() or (values == np.inf).any():
+            raise AssertionError("a density is no number")
+    if not np.isfinite(drawn).all():
+        raise AssertionError("what was drawn is not finite")
 
 
 def _check(result: pssflow.Result) -> None:

@@ -175,7 +175,7 @@ impl Guide {
         ))
     }
 
-    /// Log-density of rows of a decision's numbers.
+    /// Log-density of rows of a decision's numbers; −∞ where they lie outside the cube and the guide has no mass there.
     #[pyo3(signature = (u, decision="path", contexts=None))]
     fn log_prob(
         &self,
@@ -201,6 +201,13 @@ impl Guide {
                 .get(i * CHUNK..i * CHUNK + q.len())
                 .unwrap_or_default();
             py.detach(|| self.inner.density(decision, here, chunk, &mut q));
+            if decision != Decision::Path {
+                // Guides are never asked beyond the cube, where their formulas go on; a flow's own space is larger.
+                for (q, u) in q.iter_mut().zip(chunk.chunks_exact(width)) {
+                    let inside = u.iter().all(|u| (0.0..1.0).contains(u));
+                    *q = if inside { *q } else { 0.0 };
+                }
+            }
             log_q.extend(q.into_iter().map(f32::ln));
         }
         Ok(arrays::to_vector(py, log_q))

@@ -13,6 +13,10 @@ const HEAVY_TAIL: f64 = 0.7;
 const DISAGREEMENT: f64 = 2.0;
 const DISAGREEMENT_ERRORS: f64 = 2.0;
 
+/// How many times more rarely than random numbers a guide must draw the light to be told, and by how many standard errors.
+const RARE: f64 = 1.5;
+const RARE_ERRORS: f64 = 2.0;
+
 /// Standard errors between the means of pilot and guided paths that are told.
 const MEAN_ERRORS: f64 = 4.0;
 
@@ -115,6 +119,9 @@ pub struct Diagnostics {
     pub mean_weight: f64,
     /// Largest 1/m of a path with light; at most 1/a.
     pub max_weight: f64,
+    /// Mean 1/m of the light, Σ(c/m) ÷ Σc over the paths after the pilot: how many times more rarely it is drawn than by random
+    /// numbers; null without a guide or light.
+    pub light_weight: Option<Measured>,
     /// Largest contribution over the mean one of all camera rays.
     pub max_contribution: f64,
     /// Share of all light that the largest contribution carries.
@@ -162,6 +169,11 @@ impl Diagnostics {
             mean_square: evidence.rendered.estimates().mean_square(),
             mean_weight: evidence.rendered.mean_weight(),
             max_weight: f64::from(all.max_weight),
+            light_weight: evidence
+                .rendered
+                .light_weight()
+                .filter(|_| guided > 0)
+                .map(|(value, error)| Measured { value, error }),
             max_contribution: all.max_contribution(),
             largest_share: if all.sum > 0.0 {
                 f64::from(all.max_estimate) / all.sum
@@ -204,6 +216,14 @@ impl Diagnostics {
                 "uniform paths see {:.2} times the second moment that guided ones see: the guide misses light, and the \
                  variance estimate may be too low",
                 moment.ratio()
+            ));
+        }
+        let rare = |w: &Measured| w.value > RARE && w.value - 1.0 > RARE_ERRORS * w.error;
+        if let Some(weight) = self.light_weight.filter(rare) {
+            worries.push(format!(
+                "the guide draws the light {:.2} times more rarely than random numbers do: it was learned where the light is \
+                 not, and makes noise",
+                weight.value
             ));
         }
         if let Some(means) = self.means.filter(|m| m.z.abs() > MEAN_ERRORS) {
@@ -331,6 +351,46 @@ mod tests {
         let mut pools = Pools::default();
         pools.add_pass(&pass);
         assert_eq!(pools.second_moment(), None);
+    }
+
+    #[test]
+    fn light_that_the_guide_draws_rarely_is_told() {
+        let film = film(vec![1.0; 3]);
+        // Paths of which each brings one, with these weights.
+        let found = |weights: &[f32]| {
+            let mut side = Statistics {
+                guided: 1000,
+                ..Statistics::default()
+            };
+            side.counts.camera_rays = 1000;
+            for &w in weights {
+                side.add_estimate(Rgb::ONE, w, f64::from(w));
+            }
+            Diagnostics::of(&Evidence {
+                in_image: &side,
+                pilot: &Statistics::default(),
+                rendered: &side,
+                pools: &Pools::default(),
+                mass_outside: None,
+                film: &film,
+            })
+        };
+        let rare = found(&[8.0; 40]);
+        assert_eq!(rare.warnings.len(), 1, "{:?}", rare.warnings);
+        assert!(
+            rare.light_weight
+                .is_some_and(|w| (w.value - 8.0).abs() < 1e-5)
+        );
+        assert_eq!(found(&[1.0; 40]).warnings, [""; 0]);
+        // Ten lights drawn often and one rarely: three times on average, but who knows.
+        let unsure = found(&[[0.5; 10].as_slice(), &[28.0]].concat());
+        assert!(
+            unsure
+                .light_weight
+                .is_some_and(|w| w.value > 2.5 && w.error > 1.0)
+        );
+        assert_eq!(unsure.warnings, [""; 0]);
+        assert_eq!(found(&[]).light_weight, None);
     }
 
     #[test]

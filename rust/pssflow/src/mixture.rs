@@ -52,6 +52,20 @@ impl Mixture {
         if weight.is_finite() { weight } else { 0.0 }
     }
 
+    /// Σ lum(f/m)/m over the terms. Its mean is Σ∫f/m, so that its ratio to the mean of f/m is the mean 1/m of the light:
+    /// how many times more rarely the mixture draws it than uniform numbers would.
+    #[inline]
+    pub fn rarity(&self, f_nee: Rgb, q_nee: f32, f_bsdf: Rgb, q_bsdf: f32) -> f64 {
+        let mut sum = 0.0;
+        for (f, q) in [(f_nee, q_nee), (f_bsdf, q_bsdf)] {
+            if f != Rgb::ZERO {
+                let m = f64::from(self.density(q));
+                sum += f64::from(luminance(f)) / (m * m);
+            }
+        }
+        sum
+    }
+
     /// f²/m of the luminances, term by term: its mean over uniform numbers is ∫f²/m, which decides the variance. For a
     /// path that the guide drew it is divided by q, too: the same integral, as far as the guide's own paths see it.
     #[inline]
@@ -112,6 +126,18 @@ mod tests {
         assert!((uniform - guided).abs() < 1e-9, "{uniform} {guided}");
         assert!((uniform - 4.5 / 1.8).abs() < 1e-6);
         assert_eq!(m.square(Rgb::ZERO, 0.0, Rgb::ZERO, 0.0, true), 0.0);
+    }
+
+    #[test]
+    fn rarity_is_the_weight_of_the_light() {
+        // All light where q = 0: it is drawn a times as often as by uniform numbers.
+        let m = Mixture {
+            uniform_fraction: 0.25,
+        };
+        let (estimate, _) = m.divide(Rgb::ONE, 0.0, Rgb::ONE, 0.0);
+        let rarity = m.rarity(Rgb::ONE, 0.0, Rgb::ONE, 0.0);
+        assert!((rarity / f64::from(luminance(estimate)) - 4.0).abs() < 1e-6);
+        assert_eq!(m.rarity(Rgb::ZERO, 0.0, Rgb::ZERO, 0.0), 0.0);
     }
 
     #[test]

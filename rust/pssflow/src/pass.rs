@@ -276,7 +276,13 @@ impl PassContext<'_> {
             if f == Rgb::ZERO {
                 continue;
             }
-            piece.statistics.add_estimate(estimate, weight);
+            let rarity = mixture.rarity(
+                paths.f_nee[i],
+                paths.q_nee[i],
+                paths.f_bsdf[i],
+                paths.q_bsdf[i],
+            );
+            piece.statistics.add_estimate(estimate, weight, rarity);
             if pass.guide.is_some() {
                 let guided = mixture.is_guided(coin);
                 let square = mixture.square(

@@ -106,11 +106,13 @@ pub struct Statistics {
     pub sum: f64,
     /// Σ lum(f/m)²
     pub sum_2: f64,
+    /// Of `Mixture::rarity` r: Σr, Σr², Σ r·lum(f/m).
+    pub rarity: [f64; 3],
 }
 
 impl Statistics {
     /// Adds one path that carries light.
-    pub(crate) fn add_estimate(&mut self, estimate: Rgb, weight: f32) {
+    pub(crate) fn add_estimate(&mut self, estimate: Rgb, weight: f32, rarity: f64) {
         let y = luminance(estimate);
         self.counts.nonzero += 1;
         self.tail.add(y);
@@ -118,6 +120,8 @@ impl Statistics {
         self.max_estimate = self.max_estimate.max(y);
         self.sum += f64::from(y);
         self.sum_2 += f64::from(y) * f64::from(y);
+        let terms = [rarity, rarity * rarity, rarity * f64::from(y)];
+        self.rarity.iter_mut().zip(terms).for_each(|(s, t)| *s += t);
     }
 
     /// Adds another set.
@@ -133,6 +137,18 @@ impl Statistics {
         self.max_estimate = self.max_estimate.max(other.max_estimate);
         self.sum += other.sum;
         self.sum_2 += other.sum_2;
+        self.rarity
+            .iter_mut()
+            .zip(other.rarity)
+            .for_each(|(s, t)| *s += t);
+    }
+
+    /// Mean 1/m of the light and its standard error, as that of a ratio; `None` where there is no light.
+    pub fn light_weight(&self) -> Option<(f64, f64)> {
+        let [r, r_2, cross] = self.rarity;
+        let weight = r / self.sum;
+        let spread = r_2 - weight * (2.0 * cross - weight * self.sum_2);
+        (self.sum > 0.0).then(|| (weight, spread.max(0.0).sqrt() / self.sum))
     }
 
     /// Mean 1/m over all paths.

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ __all__ = [
     "Finding",
     "Setting",
     "render_options",
+    "sure",
     "worst",
 ]
 
@@ -103,6 +104,10 @@ class Setting:
     """In place of the effort's."""
     side: int | None = None
     """In place of the effort's."""
+    seeds: int = 0
+    """At least so many, unless training is cheap."""
+    refused: str = ""
+    """What the line holds by which a guide may refuse this; empty: it must not."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +123,11 @@ class Case:
     settings: tuple[Setting, ...] = ()
     """Scenes to render with every guide."""
     probe: Callable[[str, Effort, Path], Finding | None] | None = None
-    """What no render of a scene can show: (guide, effort, a folder for files) → finding; None where it has no sense."""
+    """What no render of a scene can show: (guide, effort, a folder for files) → finding; None where it has no sense.
+    Comes on top of the settings.
+    """
+    picture: bool = False
+    """Whether docs/limits.md shows its first setting."""
 
 
 def render_options(
@@ -132,6 +141,18 @@ def render_options(
     return {"guide": guide, **options}
 
 
-def worst(findings: list[Finding]) -> Finding:
-    """The worst of several settings' findings, with the figures of all of them that are as bad."""
-    return max(findings, key=lambda found: VERDICTS.index(found.verdict))
+def sure(numbers: Mapping[str, float | None], name: str) -> float:
+    """A number less two of its standard errors; 0 where there is none."""
+    return (numbers.get(name) or 0.0) - 2 * (numbers.get(f"{name}_error") or 0.0)
+
+
+def worst(findings: Sequence[Finding]) -> Finding:
+    """The worst of several findings, by verdict, then by ratio, with the largest second moment, both as far as sure."""
+
+    def badness(found: Finding) -> tuple[int, float]:
+        return VERDICTS.index(found.verdict), sure(found.numbers, "ratio")
+
+    found = max(findings, key=badness)
+    bound = max(findings, key=lambda f: sure(f.numbers, "bound"))
+    moments = {name: bound.numbers.get(name) for name in ("bound", "bound_error")}
+    return replace(found, numbers={**found.numbers, **moments}) if moments["bound"] else found

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,7 +14,7 @@ from ...params import Text
 from ...terminal import Terminal
 
 if TYPE_CHECKING:
-    from .case import Case, Effort, Finding
+    from .case import Case, Effort
     from .measure import Bench
 
 __all__ = ["stability"]
@@ -41,7 +42,12 @@ class Names(Text):
     "--side", type=click.IntRange(2, 512), default=16, show_default=True, help="Of a film, pixels."
 )
 @click.option("--quick", is_flag=True, help="A setting a case, tiny films, short training: a look.")
-@click.option("--pictures", metavar="DIR", help="Also writes a strip of images for each case.")
+@click.option(
+    "--page",
+    type=click.Path(exists=True, dir_okay=False),
+    metavar="FILE",
+    help="Also fills the table into FILE, between its marks, and puts pictures into the folder of that name.",
+)
 @click.option("--threads", type=click.IntRange(1, 4096), help="[default: one a core]")
 @click.option("-o", "--output", default="out/study-stability", show_default=True, metavar="DIR")
 @click.option("-q", "--quiet", is_flag=True, help="No progress, no notices.")
@@ -54,7 +60,7 @@ def stability(
     spp: int,
     side: int,
     quick: bool,
-    pictures: str | None,
+    page: str | None,
     threads: int | None,
     output: str,
     quiet: bool,
@@ -68,8 +74,9 @@ def stability(
     from ...output import make_folder
     from ..store import configuration
     from .case import QUICK, THESIS, Effort
+    from .measure import measure
     from .registry import CASES, STANDARD
-    from .results import Row, Rows, publish
+    from .results import Row, Rows, fill_page, publish
 
     terminal.quiet = quiet
     chosen = list(CASES.values())
@@ -87,7 +94,6 @@ def stability(
         effort = dataclasses.replace(QUICK, seeds=min(seeds, 4), threads=threads)
     _variant()
     folder = make_folder(output)
-    strips = make_folder(pictures) if pictures else None
     store = Rows(folder / "results.csv")
     rows: list[Row] = []
     done, total = 0, len(chosen) * len(names)
@@ -99,7 +105,6 @@ def stability(
     try:
         for case in chosen:
             benches: dict[str, Bench] = {}
-            found: dict[str, Finding] = {}
             for guide in names:
                 done += 1
                 key = configuration(
@@ -108,17 +113,15 @@ def stability(
                     effort={**dataclasses.asdict(effort), "threads": None},
                 )
                 row = store.find(key)
-                if row is None or strips is not None:
+                if row is None:
                     terminal.say(f"[{done}/{total}] {case.number} {case.name}, {guide}")
-                    finding = _examine(case, guide, effort, benches)
+                    with tempfile.TemporaryDirectory(prefix="pssflow-stability-") as scratch:
+                        finding = measure(case, guide, effort, benches, Path(scratch))
                     if finding is None:
                         continue
-                    found[guide] = finding
                     row = Row.of(case, guide, finding, effort, key)
                     store.put(row)
                 rows.append(row)
-            if strips is not None and benches:
-                _strip(strips, case.name, titles[case.name], benches, found)
     except KeyboardInterrupt:
         if rows:
             publish(folder, rows, names, titles, heading)
@@ -126,6 +129,13 @@ def stability(
     if not rows:
         raise ValueError("none of these guides has anything to do with these cases")
     terminal.out.print(publish(folder, rows, names, titles, heading))
+    if page is not None:
+        fill_page(Path(page), rows, names, titles, heading)
+        strips = make_folder(Path(page).with_suffix(""))
+        for case in chosen:
+            if case.picture:
+                terminal.say(f"picture of {case.number} {case.name}")
+                _strip(strips / f"{case.name}.png", case, titles[case.name], names, effort)
 
 
 def _variant() -> None:
@@ -136,35 +146,18 @@ def _variant() -> None:
         mi.set_variant("scalar_rgb")
 
 
-def _examine(case: Case, guide: str, effort: Effort, benches: dict[str, Bench]) -> Finding | None:
-    from .measure import measure
-
-    if case.settings:
-        return measure(case, guide, effort, benches)
-    if case.probe is None:
-        return None
-    with tempfile.TemporaryDirectory(prefix="pssflow-stability-") as scratch:
-        return case.probe(guide, effort, Path(scratch))
+PICTURE_SIDE = 32
+"""Of the pictures' films, where a case says nothing else: more than is measured, for there is something to see."""
 
 
-def _strip(
-    folder: Path,
-    name: str,
-    title: str,
-    benches: dict[str, Bench],
-    found: dict[str, Finding],
-) -> None:
-    """Truth, random numbers and guides of a case's first setting, one seed each."""
+def _strip(path: Path, case: Case, title: str, guides: Sequence[str], effort: Effort) -> None:
+    """Truth, random numbers and guides of a case's first setting, a render each."""
     from ..verdicts import strip
+    from .measure import Bench
 
-    bench = next(iter(benches.values()))
-    truth = bench.truth.mean(axis=0)
-    if truth.ndim != 3 or min(truth.shape[:2]) < 4 or not truth.any():
-        return
-    images = [("truth", truth), ("random", bench.random[0].image)]
-    images += [
-        (guide, finding.image)
-        for guide, finding in found.items()
-        if finding.image is not None and finding.image.shape == truth.shape
-    ]
-    strip(folder / f"{name}.png", title, images)
+    setting = dataclasses.replace(case.settings[0], side=max(PICTURE_SIDE, effort.side))
+    bench = Bench.of(setting, dataclasses.replace(effort, seeds=1, truth=4))
+    images = [("truth", bench.truth.mean(axis=0)), ("random", bench.random[0].image)]
+    images += [(guide, bench.run(guide)[0].image) for guide in guides]
+    size = f"{bench.effort.side} × {bench.effort.side} pixels, {bench.effort.spp} spp"
+    strip(path, f"{title} ({setting.name}; {size})", images)

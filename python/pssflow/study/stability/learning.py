@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import numpy as np
 from ...files import first_line
 from ...guide import Guide
 from ...render import Result
-from ...scene import Scene
+from ...scene import Pilot, Scene
 from .case import CHEAP, THESIS, Case, Effort, Finding, Setting, render_options, worst
 from .materials import glow
 from .measure import Bench, judge
@@ -37,13 +38,12 @@ PRIOR = Case(
             guide_options={name: {"prior": "hypercube"} for name in FLOWS},
         ),
     ),
+    picture=True,
 )
 
 
 def _outside(guide: str, effort: Effort, folder: Path) -> Finding | None:
     """How many of a guide's paths are lost outside the cube; all of it must be known to the guide itself."""
-    if guide in ("none", "auto"):
-        return None
     bench = Bench.of(Setting("room", room), effort)
     results = bench.run(guide)
     found = judge(bench, results)
@@ -91,11 +91,32 @@ def _poisoned(f: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 def _poison(guide: str, effort: Effort, folder: Path) -> Finding | None:
     """Fits a guide to poisoned records and renders with it: the poison must be dropped, counted, and harm nothing."""
     if guide in ("none", "auto"):
+        # `auto` chooses from records of its own alone; `tests/guide/select.rs` poisons these.
         return None
+    bench = _class_room(guide, effort)
+
+    def poison(pilot: Pilot, rng: np.random.Generator) -> Pilot:
+        # Some guides learn from whole paths, others from what their BSDF-sampled rays found; other rows of either.
+        return replace(pilot, f=_poisoned(pilot.f, rng), f_bsdf=_poisoned(pilot.f_bsdf, rng))
+
+    return judge(bench, _taught(bench, guide, effort, poison))
+
+
+def _class_room(guide: str, effort: Effort) -> Bench:
+    """The plain room, for guides that are taught there by hand."""
+    strategy = {"emitter_strategy": "nee"} if guide == THESIS else {}
+    return Bench.of(Setting("room", room, strategy), effort)
+
+
+def _taught(
+    bench: Bench,
+    guide: str,
+    effort: Effort,
+    change: Callable[[Pilot, np.random.Generator], Pilot],
+) -> list[Result]:
+    """A render for each seed with a guide that learned from a pilot which was changed."""
     name = "realnvp" if guide == THESIS else guide
     options = dict(CHEAP.get(guide, {})) if effort.cheap else {}
-    setting = Setting("room", room, {"emitter_strategy": "nee"} if guide == THESIS else {})
-    bench = Bench.of(setting, effort)
     strategy = "nee" if guide == THESIS else "mis"
     results: list[Result] = []
     for seed in range(effort.seeds):
@@ -106,10 +127,8 @@ def _poison(guide: str, effort: Effort, folder: Path) -> Finding | None:
             emitter_strategy=strategy,
             threads=effort.threads,
         )
-        rng = np.random.default_rng(seed)
-        # Some guides learn from whole paths, others from what their BSDF-sampled rays found; other rows of either.
-        poisoned = replace(pilot, f=_poisoned(pilot.f, rng), f_bsdf=_poisoned(pilot.f_bsdf, rng))
-        fitted = poisoned.fit(name, seed=seed, **options)
+        taught = change(pilot, np.random.default_rng(seed))
+        fitted = taught.fit(name, seed=seed, **options)
         results.append(
             bench.scene.render(
                 fitted,
@@ -118,10 +137,10 @@ def _poison(guide: str, effort: Effort, folder: Path) -> Finding | None:
                 uniform_fraction=0.0 if guide == THESIS else None,
                 threads=effort.threads,
                 progress=False,
-                **setting.options,
+                **bench.setting.options,
             )
         )
-    return judge(bench, results)
+    return results
 
 
 POISON = Case(
@@ -136,6 +155,33 @@ POISON = Case(
 
 # --- 5: almost nothing to learn from --------------------------------------------------------------
 
+
+def _few(guide: str, effort: Effort, folder: Path) -> Finding | None:
+    """Fits a guide to a pilot of which none, one or two paths carry light: it refuses with a word, or harms nothing."""
+    if guide in ("none", "auto"):
+        return None
+    bench = _class_room(guide, effort)
+    findings = []
+    for count in (0, 1, 2):
+        said = f"{count} paths with light"
+        try:
+            results = _taught(bench, guide, effort, partial(_dimmed, count=count))
+        except ValueError as error:
+            findings.append(Finding("holds", f"{said}: {first_line(error)}"))
+            continue
+        found = judge(bench, results)
+        findings.append(replace(found, why="; ".join(t for t in (said, found.why) if t)))
+    return worst(findings)
+
+
+def _dimmed(pilot: Pilot, rng: np.random.Generator, *, count: int) -> Pilot:
+    """The same paths, all but so many of which carry no light."""
+    dark = rng.permutation(np.flatnonzero(pilot.f.max(axis=1) > 0))[count:]
+    f, f_bsdf = pilot.f.copy(), pilot.f_bsdf.copy()
+    f[dark], f_bsdf[dark] = 0.0, 0.0
+    return replace(pilot, f=f, f_bsdf=f_bsdf)
+
+
 FEW = Case(
     5,
     "few-paths",
@@ -147,6 +193,7 @@ FEW = Case(
         Setting("one pixel, 2 samples", lambda _: room(1), spp=2, side=1),
         Setting("one pixel, 64 samples", lambda _: room(1), spp=64, side=1),
     ),
+    probe=_few,
 )
 
 # --- 11: training that is far too fast ------------------------------------------------------------
@@ -268,8 +315,6 @@ def _moving(guide: str, effort: Effort, folder: Path) -> Finding | None:
     """Learns with the lamp on the left, seen as here or from elsewhere, and renders with the lamp on the right: the
     saved guide is refused, and the object itself loses no more than 1/a.
     """
-    if guide == "none":
-        return None
     here = Bench.of(Setting("lamp on the right", RIGHT, blind=True), effort)
     return worst([_moved(guide, effort, folder, here, there) for there in (LEFT, _aside)])
 

@@ -10,6 +10,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ...files import first_line
 from ...guide import Guide
 from ...scene import Scene
@@ -31,12 +33,16 @@ PATIENCE = 600.0
 def _files(guide: str, effort: Effort, folder: Path) -> Finding | None:
     """Interrupts a render, cuts a guide's file, and fills the disk while it is written."""
     how = render_options(guide, effort) | {"threads": effort.threads, "progress": False}
+    interrupted = Scene(room(256))
     try:
         # So long that it cannot be over before it is asked for its progress.
-        Scene(room(256)).render(**{**how, "progress": _interrupt}, spp=1024)
+        interrupted.render(**{**how, "progress": _interrupt}, spp=1024)
         return Finding("fails", "an interrupt was ignored")
     except KeyboardInterrupt:
         pass
+    again, fresh = (s.render(**how, spp=2, seed=3).image for s in (interrupted, Scene(room(256))))
+    if not np.array_equal(again, fresh):
+        return Finding("fails", "after an interrupt the scene renders another image")
     scene = Scene(room(effort.side))
     result = scene.render(**how, spp=effort.spp, seed=3)
     if not isinstance(result.guide, Guide):

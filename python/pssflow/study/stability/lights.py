@@ -102,6 +102,7 @@ SLIT = Case(
     "The sun falls through a hole on a spot that one path in 1e4 or 1e5 meets, and gives about half of the light. No "
     "pilot sees it, and a guide that learns where light was makes it rarer by up to 1/a.",
     (_slit("1 path in 1e4", 0.03, 1024, 8), _slit("1 path in 1e5", 0.0095, 4096, 16)),
+    picture=True,
 )
 
 # --- 6: mass at the borders -----------------------------------------------------------------------
@@ -153,6 +154,7 @@ BORDERS = Case(
         Setting("rim of the lamp", _rim_of_lamp),
         Setting("first and last emitter", _last_of_many),
     ),
+    picture=True,
 )
 
 # --- 7: disconnected modes ------------------------------------------------------------------------
@@ -189,6 +191,7 @@ MODES = Case(
         Setting("2 lights", _modes(2)),
         Setting("32 lights", _modes(32)),
     ),
+    picture=True,
 )
 
 # --- 8: close lights and caustics -----------------------------------------------------------------
@@ -225,6 +228,7 @@ CLOSE = Case(
         Setting("mirror", _behind({"type": "conductor"})),
         Setting("glass", _behind({"type": "dielectric"})),
     ),
+    picture=True,
 )
 
 # --- 13, 14: the plain room many times; nothing to learn ------------------------------------------
@@ -235,7 +239,7 @@ SPREAD = Case(
     "Spread between runs",
     "Many short renders of a plain room (Celarek et al. 2019): a method whose error now and then is ten times "
     "its usual one looks fine in most pictures.",
-    (Setting("short renders", room, spp=16),),
+    (Setting("short renders", room, spp=16, seeds=20),),
 )
 
 
@@ -272,4 +276,5 @@ EASY = Case(
     "An easy scene",
     "Random numbers are nearly optimal here; whatever a guide does can only cost. The right answer is `none`.",
     (Setting("even sky", _sky), Setting("furnace", _furnace)),
+    picture=True,
 )

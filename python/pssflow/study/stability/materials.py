@@ -59,6 +59,7 @@ GLOSSY = Case(
         Setting("α = .01", _glossy(0.01)),
         Setting("masks", _masked),
     ),
+    picture=True,
 )
 
 
@@ -134,17 +135,28 @@ SCALES = Case(
 
 
 def _wide(_: int) -> Description:
-    return room((16384, 1))
+    """A line of a square film."""
+    side = 16384
+    scene = room(side)
+    scene["camera"]["film"] |= {
+        "crop_width": side,
+        "crop_height": 1,
+        "crop_offset_x": 0,
+        "crop_offset_y": side // 2,
+    }
+    return scene
 
 
 EXTREMES = Case(
     16,
     "extremes",
     "Tiny and wide films, many bounces",
-    "One pixel, one sample; a film 16,384 pixels wide and one high; ten bounces, 21 numbers.",
+    "One pixel, one sample; a crop 16,384 pixels wide and one high; ten bounces, 21 numbers.",
     (
         Setting("k = 10", room, {"k": 10}),
         Setting("one pixel", lambda _: room(1), side=1),
+        # There is none left for a guide that is asked for by name.
+        Setting("one pixel, one sample", lambda _: room(1), spp=1, side=1, refused="`spp`"),
         Setting("one pixel, two samples", lambda _: room(1), spp=2, side=1),
         Setting("16,384 × 1", _wide, spp=4),
     ),

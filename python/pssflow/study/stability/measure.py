@@ -2,17 +2,20 @@
 
 A guide *holds* where its images are finite and unbiased (the mean and tiles against the truth: by Welch's test, or with
 the variance that the renders state where seeds are few), no
-path weighs more than 1/a, E[(f/m)²] ≤ E[f²]/a within its error, and its relMSE is at most 1.3 times that of as many
-random samples (median over seeds). It *degrades* where it is only slower, and *fails* where one of the others
-breaks, or at a = 0 is more than ten times slower. (With a > 0 the second moment has a bound. The variance, which is
+path weighs more than 1/a or is dropped as not finite, E[1/m] = 1 and E[(f/m)²] ≤ E[f²]/a within their errors, and its
+relMSE is at most 1.3 times that of as many random samples (median over seeds; means at a = 0, and where no pilot
+contains the failure: there a few paths decide, and the median is that of the seeds which were spared). It *degrades*
+where it is only slower, and *fails* where one of the others breaks, where it is slower than 1/a times though no pilot
+contains the failure, or at a = 0 more than ten times. (With a > 0 the second moment has a bound. The variance, which is
 what is left of it without I², can exceed 1/a times that of random numbers where these have hardly any.)
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,9 +28,10 @@ from ...scene import Scene
 from ..welch import ALPHA, LUMINANCE, Moments, holm, p_value, tile_means, welch
 from .case import THESIS, Case, Effort, Finding, Setting, render_options, worst
 
-__all__ = ["HARMLESS", "Bench", "judge", "measure"]
+__all__ = ["HARMLESS", "TELLING", "Bench", "judge", "measure"]
 
 F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
 
 HARMLESS = 1.3
 """Times the error of random numbers at equal samples that is no harm: a pilot that taught nothing costs a part."""
@@ -40,6 +44,9 @@ ERRORS = 4.0
 
 FEW_SEEDS = 8
 """Fewer images than these say so little of their variance that no bias would be seen; the renders' own is taken."""
+
+TELLING = 0.5
+"""Share of the renders that must warn of what no pilot contains."""
 
 FIRST_SEED = 1000
 """Of the renders; the truth counts from 0."""
@@ -61,7 +68,12 @@ class Bench:
     @classmethod
     def of(cls, setting: Setting, effort: Effort) -> Bench:
         """Loads a setting's scene and renders what guides are compared with."""
-        effort = replace(effort, spp=setting.spp or effort.spp, side=setting.side or effort.side)
+        effort = replace(
+            effort,
+            spp=setting.spp or effort.spp,
+            side=setting.side or effort.side,
+            seeds=effort.seeds if effort.cheap else max(effort.seeds, setting.seeds),
+        )
         scene = Scene(setting.scene(effort.side))
         many = {**setting.options, "threads": effort.threads, "progress": False}
         random = [
@@ -93,8 +105,13 @@ class Bench:
         ]
 
 
-def measure(case: Case, guide: str, effort: Effort, benches: dict[str, Bench]) -> Finding:
-    """The worst of a case's settings for a guide; `benches` keeps what guides share, by setting."""
+def measure(
+    case: Case, guide: str, effort: Effort, benches: dict[str, Bench], folder: Path
+) -> Finding | None:
+    """The worst of a case's settings and its probe for a guide; None where the case has no sense for it.
+
+    `benches` keeps what guides share, by setting; `folder` is for files.
+    """
     settings = case.settings if effort.extremes else case.settings[:1]
     findings = []
     for setting in settings:
@@ -104,11 +121,15 @@ def measure(case: Case, guide: str, effort: Effort, benches: dict[str, Bench]) -
         try:
             found = judge(bench, bench.run(guide))
         except (ValueError, RuntimeError, MemoryError) as error:
-            found = Finding("fails", first_line(error))
+            allowed = isinstance(error, ValueError) and setting.refused
+            told = bool(allowed) and setting.refused in str(error) and "\n" not in str(error)
+            found = Finding("holds" if told else "fails", first_line(error))
         if len(settings) > 1:
             found = replace(found, why="; ".join(t for t in (setting.name, found.why) if t))
         findings.append(found)
-    return worst(findings)
+    if case.probe is not None and (found := case.probe(guide, effort, folder)) is not None:
+        findings.append(found)
+    return worst(findings) if findings else None
 
 
 def judge(bench: Bench, results: Sequence[Result]) -> Finding:
@@ -144,11 +165,16 @@ def judge(bench: Bench, results: Sequence[Result]) -> Finding:
             "holds" if lit == 0 else "fails",
             "black, as it should be" if lit == 0 else f"{lit:g} in a black image",
         )
-    numbers |= _errors(bench, images)
+    numbers |= _errors(bench, images, a)
     numbers["bound"], error = _bound(bench, results, a)
     numbers["bound_error"] = error
     if a > 0 and (weight := numbers["max_weight"]) is not None and weight > (1 + 1e-5) / a:
         return finding("fails", f"a path weighs {weight:.4g} > 1/a = {1 / a:.4g}")
+    dropped, usual = (sum(r.stats["non_finite"] for r in rs) for rs in (results, bench.random))
+    if a > 0 and dropped and not usual:
+        return finding("fails", f"{dropped} paths were not finite; of random numbers' none")
+    if a > 0 and (off := _weight_is_off(results, a)):
+        return finding("fails", off)
     figure = _figure(numbers)
     if a == 0 and (z := _missing(results)) < -ERRORS:
         what = f"light is missing: {z:.0f} standard errors below the pilot's mean; {figure}"
@@ -168,19 +194,34 @@ def judge(bench: Bench, results: Sequence[Result]) -> Finding:
     bound = numbers["bound"]
     if a > 0 and bound is not None and bound - ERRORS * error > 1.0:
         return finding("fails", f"E[(f/m)²] = {bound:.3g} · E[f²]/a")
-    ratio = numbers["ratio"] or 0.0
-    if a == 0 and max(ratio, numbers["mean_ratio"] or 0.0) > HOPELESS:
-        return finding("fails", f"{figure}, mean of the seeds {numbers['mean_ratio']:.2g} ×")
+    ratio, spread = numbers["ratio"] or 0.0, numbers["ratio_error"] or 0.0
+    if a == 0 and max(ratio, numbers["median_ratio"] or 0.0) > HOPELESS:
+        return finding("fails", figure)
+    if a > 0 and bench.setting.blind and ratio - ERRORS * spread > 1 / a:
+        return finding("fails", f"{figure}: more than 1/a")
     if ratio <= HARMLESS and not unsure:
         return finding("holds", figure)
-    silent = bench.setting.blind and (numbers["warned"] or 0.0) < 0.5
+    silent = bench.setting.blind and (numbers["warned"] or 0.0) < TELLING
     return finding(
         "degrades", figure, unsure or ("most renders say nothing of it" if silent else "")
     )
 
 
-def _errors(bench: Bench, images: F32) -> dict[str, float | None]:
-    """RelMSE of guide and random numbers, medians over the seeds, and how far outliers stand out."""
+def _weight_is_off(results: Sequence[Result], a: float) -> str:
+    """What is wrong with the mean of 1/m over the paths of all renders, which is 1 where a guide's densities are those
+    that it draws with; 1/m lies between 0 and 1/a, so that its variance is at most 1/a − 1.
+    """
+    paths = np.array([r.stats["camera_rays"] for r in results], np.float64)
+    if not paths.sum():
+        return ""
+    means = [r.stats["diagnostics"]["mean_weight"] for r in results]
+    mean = float(np.average(means, weights=paths))
+    error = math.sqrt((1 / a - 1) / paths.sum()) + 1e-5
+    return "" if abs(mean - 1) <= 5 * error else f"E[1/m] = {mean:.4g} ± {error:.1g}, not 1"
+
+
+def _errors(bench: Bench, images: F32, a: float) -> dict[str, float | None]:
+    """RelMSE of guide and random numbers over the seeds, and how far outliers stand out."""
     truth = bench.truth.mean(axis=0)
     variance = bench.truth.var(axis=0, ddof=1) / len(bench.truth)
     ours = np.array([metrics.relmse(image, truth, variance) for image in images])
@@ -190,14 +231,29 @@ def _errors(bench: Bench, images: F32) -> dict[str, float | None]:
     middle = [max(float(np.median(side)), least) for side in (ours, theirs)]
     mean = [max(float(side.mean()), least) for side in (ours, theirs)]
     # Where a few paths decide an error, its median is that of the seeds which were spared.
-    shown = mean if bench.setting.blind else middle
+    by_mean = bench.setting.blind or a == 0
+    shown = mean if by_mean else middle
     return {
         "relmse": shown[0],
         "relmse_random": shown[1],
         "ratio": shown[0] / shown[1],
-        "mean_ratio": mean[0] / mean[1],
+        "ratio_error": _ratio_error(ours, theirs, np.mean if by_mean else np.median, least),
+        "median_ratio": middle[0] / middle[1],
         "outlier": float(ours.max()) / middle[0],
     }
+
+
+def _ratio_error(ours: F64, theirs: F64, centre: Callable[..., F64], least: float) -> float:
+    """Standard error of the ratio of two centres, from a thousand bootstraps of the seeds: half of what holds the
+    middle 68 %. A seed's two errors stay together, for they have random numbers in common.
+    """
+    rng = np.random.default_rng(0)
+    rows = rng.integers(len(ours), size=(1000, len(ours)))
+    paired = len(ours) == len(theirs)
+    others = rows if paired else rng.integers(len(theirs), size=(1000, len(theirs)))
+    drawn = [np.maximum(centre(s[r], axis=1), least) for s, r in ((ours, rows), (theirs, others))]
+    low, high = np.quantile(drawn[0] / drawn[1], [0.16, 0.84])
+    return float(high - low) / 2
 
 
 def _bound(bench: Bench, results: Sequence[Result], a: float) -> tuple[float | None, float]:
@@ -265,7 +321,8 @@ def _missing(results: Sequence[Result]) -> float:
 
 def _figure(numbers: dict[str, Any]) -> str:
     weight = numbers["max_weight"]
-    text = f"relMSE {numbers['ratio']:.2g} × random's, max 1/m {weight:.3g}"
+    ratio, error = numbers["ratio"], numbers["ratio_error"]
+    text = f"relMSE {ratio:.2g} ± {error:.1g} × random's, max 1/m {weight:.3g}"
     if numbers.get("bound") is not None and numbers["a"] > 0:
         text += f", a·E[(f/m)²]/E[f²] {numbers['bound']:.2g} ± {numbers['bound_error']:.1g}"
     if numbers["outlier"] > 5:

@@ -16,13 +16,23 @@ from ...files import first_line, write_beside
 from ...report import markdown_table
 from ..store import commit, processor
 from ..verdicts import VERDICT_COLOURS, verdict_chart
-from .case import Case, Effort, Finding
+from .case import THESIS, Case, Effort, Finding
 
 __all__ = ["Row", "Rows", "publish"]
 
 STYLES = {"holds": "green", "degrades": "yellow", "fails": "red"}
 
-FIGURES = ("ratio", "bound", "bound_error", "max_weight", "p", "outlier", "pareto_k", "warned")
+FIGURES = (
+    "ratio",
+    "ratio_error",
+    "bound",
+    "bound_error",
+    "max_weight",
+    "p",
+    "outlier",
+    "pareto_k",
+    "warned",
+)
 """Numbers of a finding that have a column."""
 
 
@@ -39,7 +49,9 @@ class Row:
     warnings: str
     """The first two."""
     ratio: str
-    """relMSE ÷ that of random numbers at equal samples, medians over seeds."""
+    """relMSE ÷ that of random numbers at equal samples: medians over seeds, or means (`measure`)."""
+    ratio_error: str
+    """Its standard error."""
     bound: str
     """a · E[(f/m)²] ÷ E[f²]."""
     bound_error: str
@@ -142,8 +154,7 @@ def publish(
     Raises:
         OSError: a file cannot be written.
     """
-    cases = list(dict.fromkeys(row.case for row in rows))
-    cells = {(row.case, row.guide): row for row in rows}
+    cases, cells = _grid(rows)
     shown = Table(title=heading)
     shown.add_column("case")
     for guide in guides:
@@ -171,14 +182,8 @@ def publish(
     lines = [
         f"# {heading}",
         CAPTION,
-        markdown_table(
-            ["case", *guides],
-            [
-                [titles[case], *(_cell(cells.get((case, guide))) for guide in guides)]
-                for case in cases
-            ],
-            texts=1 + len(guides),
-        ),
+        _verdicts(rows, guides, titles),
+        _moments(rows),
         markdown_table(["guide", *VERDICT_COLOURS], counts),
         "## Figures",
         markdown_table(
@@ -192,16 +197,77 @@ def publish(
     return shown
 
 
+def fill_page(
+    page: Path, rows: Sequence[Row], guides: Sequence[str], titles: dict[str, str], heading: str
+) -> None:
+    """Puts the table, with what it was measured, between the marks of a page that is otherwise written by hand.
+
+    Raises:
+        OSError: the page cannot be written.
+        ValueError: it has no such marks.
+    """
+    before, opening, rest = page.read_text(encoding="utf-8").partition(MARKS[0])
+    _, closing, after = rest.partition(MARKS[1])
+    if not opening or not closing:
+        raise ValueError(f"{page}: has no lines {MARKS[0]} and {MARKS[1]} to put a table between")
+    days = sorted({row.when[:10] for row in rows})
+    made = [" to ".join(dict.fromkeys((days[0], days[-1])))]
+    made += ["commit " + ", ".join(sorted({row.commit for row in rows}))]
+    made += sorted({row.processor for row in rows})
+    parts = [f"{heading}.", _verdicts(rows, guides, titles), _moments(rows), "; ".join(made) + "."]
+    text = "\n\n".join([before + opening, *parts, closing + after])
+    write_beside(page, lambda part: part.write_text(text, encoding="utf-8"))
+
+
+MARKS = ("<!-- pssflow study stability -->", "<!-- end -->")
+"""Lines of a page between which the table is put."""
+
 CAPTION = (
-    "Numbers are relMSE ÷ that of as many random samples (medians over seeds; means in cases 3 and 15). Holds: finite, "
-    "unbiased, no weight above 1/a, at most 1.3. Degrades: safe, but slower. Fails: biased, unbounded, not finite, or "
-    "at a = 0 more than ten times slower. "
+    "Numbers are relMSE ÷ that of as many random samples: medians over seeds, with their standard errors; means for "
+    "thesis and in cases 3 and 15, where a few paths decide. Holds: finite, unbiased, no weight above 1/a, at most "
+    "1.3. Degrades: safe, but slower. Fails: biased, unbounded, not finite, or more than ten times slower at a = 0. "
     "thesis: a = 0; all others with the guide's own share a of random numbers."
 )
 
 
+def _grid(rows: Sequence[Row]) -> tuple[list[str], dict[tuple[str, str], Row]]:
+    """The cases, and each one's row of each guide."""
+    return list(dict.fromkeys(row.case for row in rows)), {(r.case, r.guide): r for r in rows}
+
+
+def _verdicts(rows: Sequence[Row], guides: Sequence[str], titles: dict[str, str]) -> str:
+    """The table of verdicts."""
+    cases, cells = _grid(rows)
+    lines = [
+        [titles[case], *(_cell(cells.get((case, guide))) for guide in guides)] for case in cases
+    ]
+    return markdown_table(["case", *guides], lines, texts=1 + len(guides))
+
+
+def _moments(rows: Sequence[Row]) -> str:
+    """The largest second moment that a guide with 0 < a < 1 came to, as far as it is sure."""
+    bounded = [row for row in rows if row.bound and row.guide not in (THESIS, "auto")]
+    if not bounded:
+        return ""
+    row = max(bounded, key=lambda row: float(row.bound) - 2 * float(row.bound_error))
+    return (
+        "The largest a·E[(f/m)²] ÷ E[f²] of a guide with a > 0, less two of its standard errors, belongs to "
+        f"{row.guide} in case {row.number}; theory allows 1: "
+        f"{float(row.bound):.3g} ± {float(row.bound_error):.1g}."
+    )
+
+
 def _short(row: Row) -> str:
-    return f"{float(row.ratio):.2g}" if row.ratio else ""
+    if not row.ratio:
+        return ""
+    error = f" ± {_rounded(float(row.ratio_error), 1)}" if row.ratio_error else ""
+    return _rounded(float(row.ratio), 2) + error
+
+
+def _rounded(value: float, digits: int) -> str:
+    """So many digits, without an exponent while that is no longer than a few zeros."""
+    text = f"{value:.{digits}g}"
+    return f"{float(text):.0f}" if 1 <= abs(value) < 1e5 and "e" in text else text
 
 
 def _cell(row: Row | None) -> str:

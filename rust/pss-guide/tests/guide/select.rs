@@ -70,6 +70,40 @@ fn nothing_is_chosen_where_nothing_pays() {
     }
 }
 
+/// A path of a million times the mean, numbers that are none and denormals among the records: what is chosen is no worse than
+/// random numbers by more than the 1.3 that a pilot may cost.
+#[test]
+fn poisoned_paths_choose_no_harm() {
+    let world = World::DEFAULT;
+    let random = Selection {
+        recipe: None,
+        uniform_fraction: 1.0,
+        fit: None,
+        candidates: Vec::new(),
+    };
+    let usual = variance(&world, &random);
+    for stream in 1..=3 {
+        let mut drawn = world.draw(4000, None, stream);
+        let mean = drawn.f.iter().sum::<f32>() / drawn.f.len() as f32;
+        let poison = [
+            1e6 * mean,
+            f32::NAN,
+            f32::INFINITY,
+            f32::NEG_INFINITY,
+            1e-42,
+            -1.0,
+        ];
+        for (i, value) in poison.into_iter().enumerate() {
+            drawn.f[100 * i + stream as usize] = value;
+            drawn.f_bsdf[100 * i + 50 + stream as usize] = value;
+        }
+        let candidates = candidates().unwrap();
+        let selection = select(&drawn.records(), &candidates, &PLENTY, 1, &mut |_| true).unwrap();
+        let harm = variance(&world, &selection) / usual;
+        assert!(harm < 1.3, "{harm}: {:?}", selection.candidates);
+    }
+}
+
 /// One or two paths, or none, are no ground for a choice.
 #[test]
 fn few_paths_choose_nothing() {
