@@ -65,3 +65,35 @@ def test_all_light_has_mitsubas_mean(name: str, depth: int, guide: str, artifact
     assert r.p > ALPHA / 2, r.explain(artifacts)
     assert r.has_power, r.explain(artifacts)
     assert welch(truth, np.float32(1.02) * ours).p < ALPHA / 2
+
+
+@pytest.mark.parametrize(
+    ("name", "depth", "rr_depth", "guide"),
+    [
+        ("furnace_sphere", 9, 2, "none"),
+        *(
+            pytest.param(*case, marks=pytest.mark.long)
+            for case in (
+                ("furnace_sphere", 9, 1, "table"),
+                ("white-room", 12, 2, "auto"),
+                ("glass_room", 10, 3, "auto"),
+                ("cornell-box", 8, 3, "table"),
+                ("open_sky", 6, 1, "auto"),
+            )
+        ),
+    ],
+)
+def test_roulette_loses_no_light(
+    name: str, depth: int, rr_depth: int, guide: str, artifacts: Path
+) -> None:
+    """H0: equal means where long paths are left to chance; with 2 % more, and of what they hold half, they are not."""
+    mi.set_variant(LLVM)
+    scene = load_named(name)
+    truth = mitsuba_runs(scene, max_depth=depth, seeds=range(RUNS), spp=128)
+    ours = light_runs(scene, guide=guide, max_depth=depth, rr_depth=rr_depth, spp=32)
+    r = welch(truth, ours)
+    assert r.p > ALPHA / 2, r.explain(artifacts)
+    assert r.has_power, r.explain(artifacts)
+    assert welch(truth, np.float32(1.02) * ours).p < ALPHA / 2
+    short = mitsuba_runs(scene, max_depth=rr_depth, seeds=range(RUNS), spp=128)
+    assert welch(truth, 0.5 * (short + ours)).p < ALPHA / 2

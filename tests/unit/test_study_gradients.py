@@ -66,7 +66,7 @@ def _rows(method: str, noise: float, elapsed: float = 1.0, bias: float = 0.0) ->
 
 
 def test_a_gain_is_variance_times_seconds():
-    """Half the noise in twice the time: a gain of two, whatever a parameter's unit; what has no gradient is left out."""
+    """Half the noise in twice the time: a gain of two, whatever a parameter's unit; no gradient, no ratio."""
     rows = [*_rows("none", 0.2), *_rows("better", 0.1, elapsed=2.0), *_rows("same", 0.2)]
     better, same = gains(rows)
     assert set(better.ratios) == {"wall", "lamp"}
