@@ -4,14 +4,13 @@ Each length has a guide of its own and its own samples: of a budget it gets what
 the error most (`rust/pssflow/src/lengths.rs`). The shares are fixed before sampling and no path of the probe is in the
 image, so the sum is as unbiased as its parts. Each part is a render that can be replayed; so can the sum.
 
-With `rr_depth` long paths, from that many bounces on, may get less than one sample a pixel: a share s of a sample is
-one that is traced with probability s and then counts 1 ÷ s, which is Russian roulette before the first ray.
+With `rr_depth` long paths, from that many bounces on, may get less than one sample a pixel: of four samples each is
+traced with probability s and then counts 1 ÷ s, which is Russian roulette before the first ray.
 """
 
 from __future__ import annotations
 
 import json
-import math
 import time as clock
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -33,6 +32,10 @@ __all__ = ["check_depth", "check_roulette", "render_light", "share_layer"]
 
 ODD = 0x9E3779B97F4A7C15
 """Distance of the seeds of two lengths: their paths must not repeat each other's numbers, or errors would add up."""
+
+
+LEAST_CHANCES = 4
+"""Samples per pixel that share what is left to chance, at least: of a single one no variance is known."""
 
 
 def check_depth(max_depth: Any, choice: Choice, plan: Plan, preset: str | None) -> int:
@@ -81,19 +84,6 @@ class _Part:
     strategy: str
     probe: Mapping[str, Any]
     """What the core says of it; its `spp` is a fraction."""
-
-    def budget(self, plan: Plan, rr_depth: int | None) -> Plan:
-        """The plan of the length alone, but for its time: with roulette a share of a sample is a chance of one."""
-        own = replace(
-            plan, k=max(self.k, 0), emitter_strategy=self.strategy, seed=_seed(plan, self.k)
-        )
-        wanted = self.probe["spp"]
-        if rr_depth is None or self.k < rr_depth:
-            return own if plan.spp is None else replace(own, spp=max(round(wanted), 1))
-        if plan.spp is None:
-            return replace(own, survival=min(wanted, 1.0))
-        spp = math.ceil(wanted)
-        return replace(own, spp=spp, survival=wanted / spp)
 
     @property
     def cost(self) -> float:
@@ -173,11 +163,22 @@ def _by_budget(
     total = sum(part.cost for part in parts)
     done = 0.0
     for part in parts:
-        own = part.budget(plan, rr_depth)
-        if plan.time is not None:
+        own = replace(
+            plan, k=max(part.k, 0), emitter_strategy=part.strategy, seed=_seed(plan, part.k)
+        )
+        chance = rr_depth is not None and part.k >= rr_depth
+        if plan.time is None:
+            wanted = part.probe["spp"]
+            own = replace(own, spp=max(round(wanted), 1))
+            own = _left_to_chance(own, wanted) if chance else own
+        else:
             # What a part leaves or takes too much is shared by those after it.
             left = max(plan.time - (clock.perf_counter() - start), 1e-3)
-            own = replace(own, time=max(left * part.cost / max(total - done, 1e-9), 1e-3))
+            share = max(left * part.cost / max(total - done, 1e-9), 1e-3)
+            own = replace(own, time=share)
+            if chance and results:
+                rays = part.probe["rays"] * scene.width * scene.height
+                own = _left_to_chance(own, share * _speed(parts, results) / rays)
         guide = choice
         if part.k == 0 or _too_few(choice, own):
             guide = choose("none", {})
@@ -215,6 +216,24 @@ def _by_records(
         span = (i / len(records), (i + 1) / len(records))
         results.append(run(scene, guide, own, _within(listener, span)))
     return results
+
+
+def _left_to_chance(plan: Plan, wanted: float) -> Plan:
+    """With few samples per pixel wanted, more of them, each with so small a chance that they cost as much.
+
+    Which pixels have one varies, and so costs a little of what it saves: from two on, numbers are rounded.
+    """
+    if wanted >= 0.5 * LEAST_CHANCES:
+        return plan
+    spp = None if plan.spp is None else LEAST_CHANCES
+    return replace(plan, spp=spp, survival=wanted / LEAST_CHANCES)
+
+
+def _speed(parts: Sequence[_Part], results: Sequence[Result]) -> float:
+    """Rays a second of what was rendered so far."""
+    done = list(zip(parts, results, strict=False))
+    rays = sum(result.stats["camera_rays"] * part.probe["rays"] for part, result in done)
+    return rays / max(sum(result.stats["seconds"]["render"] for _, result in done), 1e-9)
 
 
 def _too_few(choice: Choice, plan: Plan) -> bool:

@@ -90,7 +90,8 @@ def test_roulette_loses_no_light(
     mi.set_variant(LLVM)
     scene = load_named(name)
     truth = mitsuba_runs(scene, max_depth=depth, seeds=range(RUNS), spp=128)
-    ours = light_runs(scene, guide=guide, max_depth=depth, rr_depth=rr_depth, spp=32)
+    spp = 32 if guide == "none" else 96
+    ours = light_runs(scene, guide=guide, max_depth=depth, rr_depth=rr_depth, spp=spp)
     r = welch(truth, ours)
     assert r.p > ALPHA / 2, r.explain(artifacts)
     assert r.has_power, r.explain(artifacts)

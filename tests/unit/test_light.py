@@ -13,6 +13,7 @@ import pytest
 import pssflow
 from pssflow import light
 from pssflow.cli import main
+from pssflow.options import Plan
 from tests import scenes
 
 XML = str(Path(__file__).parents[2] / "scenes" / "cornell-box" / "scene.xml")
@@ -259,6 +260,10 @@ def test_long_paths_are_left_to_chance(scene):
             assert length["survival"] == 1.0
             assert length["camera_rays"] == paths
             continue
+        if expected >= 2.0:
+            assert (length["survival"], length["spp"]) == (1.0, round(expected))
+            continue
+        assert length["spp"] == 4
         assert length["spp"] * length["survival"] == pytest.approx(expected, rel=1e-5)
         traced = length["camera_rays"]
         spread = (paths * length["survival"] * (1.0 - length["survival"])) ** 0.5
@@ -285,12 +290,24 @@ def test_chance_goes_by_the_seed_alone(scene):
     assert (ended[0] != ended[1]).any()
 
 
+def _plan(time: float) -> Plan:
+    return Plan.make(learns=False, time=time)
+
+
 def test_by_time_the_chance_is_what_a_sample_is_worth(scene):
-    stats = _render(scene, "none", time=0.5, max_depth=9, rr_depth=2).stats
-    survival = {length["k"]: length["survival"] for length in stats["lengths"]}
-    assert survival[1] == 1.0
-    assert 0.0 < survival[8] < 0.1
-    assert stats["lengths"][8]["camera_rays"] > 0
+    """Where there is no time for a sample of each length; with time enough nothing is left to chance."""
+    survival = {}
+    for time in (1e-3, 1e3):
+        parts = light._probe(scene, _plan(time), 9, 2)
+        one = pssflow.render(scene, "none", spp=1, k=1, progress=False)
+        speed = light._speed(parts, [one])
+        assert speed > 0.0
+        rays = parts[8].probe["rays"] * scene.width * scene.height
+        survival[time] = light._left_to_chance(_plan(time), time * speed / rays).survival
+    assert 0.0 < survival[1e-3] < survival[1e3] == 1.0
+    stats = _render(scene, "none", time=1e-3, max_depth=9, rr_depth=2).stats
+    assert stats["lengths"][1]["survival"] == 1.0
+    assert 0.0 < stats["lengths"][8]["survival"] < 0.5
 
 
 @pytest.mark.parametrize(

@@ -33,6 +33,10 @@ STUDIES = {
         "gradients",
         "Variance of gradients against uniform numbers at equal time, parameter by parameter.",
     ),
+    "light": (
+        "light",
+        "Whole images against Mitsuba's path at the same depth: error × time, wins and losses.",
+    ),
     "results": (
         "results",
         "docs/results.md from a finished study: wins and losses of every method, and how it was measured.",
