@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -56,34 +56,39 @@ class Gain:
 def gains(rows: Sequence[GradientRow]) -> list[Gain]:
     """All methods but the baseline, scene by scene; parameters that the image does not depend on are left out."""
     found = []
-    for scene in dict.fromkeys(row.scene for row in rows):
-        own = [row for row in rows if row.scene == scene]
-        base = _runs(own, BASELINE)
-        for method in dict.fromkeys(row.method for row in own):
-            runs = _runs(own, method)
-            if method == BASELINE or min(len(base), len(runs)) < 3:
-                continue
-            names = [
-                name for name in runs[0] if min(_work(side, name) for side in (base, runs)) > 0.0
-            ]
-            if not names:
-                continue
-            of = [row for row in own if row.method == method]
-            found.append(
-                Gain(
-                    scene=scene,
-                    method=method,
-                    ratios={name: _work(base, name) / _work(runs, name) for name in names},
-                    mean=_mean(base, runs, names),
-                    spp=float(np.mean([row.spp for row in of])),
-                    elapsed=float(np.mean([row.elapsed for row in of])),
-                )
+    for scene, method, base, runs in _against_uniform(rows, least=3):
+        names = [name for name in runs[0] if min(_work(of, name) for of in (base, runs)) > 0.0]
+        if not names:
+            continue
+        of = [next(iter(run.values())) for run in runs]
+        found.append(
+            Gain(
+                scene=scene,
+                method=method,
+                ratios={name: _work(base, name) / _work(runs, name) for name in names},
+                mean=_mean(base, runs, names),
+                spp=float(np.mean([row.spp for row in of])),
+                elapsed=float(np.mean([row.elapsed for row in of])),
             )
+        )
     return found
 
 
 Run = dict[str, "GradientRow"]
 """By parameter."""
+
+
+def _against_uniform(
+    rows: Sequence[GradientRow], least: int
+) -> Iterator[tuple[str, str, list[Run], list[Run]]]:
+    """Scene, method, the runs of uniform numbers and the method's own, where both are so many."""
+    for scene in dict.fromkeys(row.scene for row in rows):
+        own = [row for row in rows if row.scene == scene]
+        base = _runs(own, BASELINE)
+        for method in dict.fromkeys(row.method for row in own):
+            runs = _runs(own, method)
+            if method != BASELINE and min(len(base), len(runs)) >= least:
+                yield scene, method, base, runs
 
 
 def _runs(rows: Sequence[GradientRow], method: str) -> list[Run]:
@@ -119,28 +124,22 @@ def _mean(base: Sequence[Run], runs: Sequence[Run], names: Sequence[str]) -> Est
 def differing(rows: Sequence[GradientRow]) -> list[str]:
     """A line for each method whose gradients are others than those of uniform numbers: they should not be."""
     lines = []
-    for scene in dict.fromkeys(row.scene for row in rows):
-        own = [row for row in rows if row.scene == scene]
-        base = _runs(own, BASELINE)
-        for method in dict.fromkeys(row.method for row in own):
-            runs = _runs(own, method)
-            if method == BASELINE or min(len(base), len(runs)) < 2:
-                continue
-            # What the image does not depend on has no variance on either side.
-            sides = [
-                np.stack([np.concatenate([r.values for r in run.values()]) for run in side])
-                for side in (base, runs)
-            ]
-            known = (sides[0].var(axis=0) > 0) & (sides[1].var(axis=0) > 0)
-            if not known.any():
-                continue
-            a, b = (Moments.of(side[:, known]) for side in sides)
-            p = holm(p_value(a, b))
-            if p.min() < ALPHA:
-                lines.append(
-                    f"BIASED? {method} on {scene_title(scene)}: a gradient differs from that of uniform numbers, "
-                    f"p = {p.min():.1g} after Holm"
-                )
+    for scene, method, base, runs in _against_uniform(rows, least=2):
+        sides = [
+            np.stack([np.concatenate([r.values for r in run.values()]) for run in side])
+            for side in (base, runs)
+        ]
+        # What the image does not depend on has no variance on either side.
+        known = (sides[0].var(axis=0) > 0) & (sides[1].var(axis=0) > 0)
+        if not known.any():
+            continue
+        a, b = (Moments.of(side[:, known]) for side in sides)
+        p = holm(p_value(a, b))
+        if p.min() < ALPHA:
+            lines.append(
+                f"BIASED? {method} on {scene_title(scene)}: a gradient differs from that of uniform numbers, "
+                f"p = {p.min():.1g} after Holm"
+            )
     return lines
 
 
