@@ -16,9 +16,9 @@ import pytest
 
 import pssflow
 from tests.conftest import LLVM
-from tests.support.named import SHIPPED, load_named
+from tests.support.named import HARD, SHIPPED, load_named
 from tests.support.runs import Runs, mitsuba_runs
-from tests.support.welch import ALPHA, welch
+from tests.support.welch import ALPHA, welch, welch_where_power
 
 pytestmark = [pytest.mark.stat, pytest.mark.timeout(600)]
 
@@ -65,6 +65,18 @@ def test_all_light_has_mitsubas_mean(name: str, depth: int, guide: str, artifact
     assert r.p > ALPHA / 2, r.explain(artifacts)
     assert r.has_power, r.explain(artifacts)
     assert welch(truth, np.float32(1.02) * ours).p < ALPHA / 2
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("name", "depth"), [*((name, 4) for name in HARD), ("door-ajar", 8)])
+def test_all_light_of_hard_scenes_has_mitsubas_mean(name: str, depth: int) -> None:
+    """H0: equal means; tiles that no larger tile gives power are counted, not tested."""
+    mi.set_variant(LLVM)
+    scene = load_named(name)
+    truth = mitsuba_runs(scene, max_depth=depth, seeds=range(RUNS), spp=256)
+    verdict = welch_where_power(truth, light_runs(scene, guide="auto", max_depth=depth, spp=128))
+    assert verdict.p > ALPHA / 2, verdict.explain()
+    assert verdict.without_power <= verdict.tiles / 2, verdict.explain()
 
 
 @pytest.mark.parametrize(
