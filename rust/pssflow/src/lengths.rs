@@ -226,7 +226,13 @@ mod tests {
     fn behind_the_depth_of_roulette_the_cost_stays_finite() {
         let deep = |n: usize| -> Vec<Length> {
             (0..n)
-                .map(|k| length(k, 0.5f64.powi(k as i32), (k + 2) as f64))
+                .map(|k| {
+                    let fades = 0.25f64.powi(k as i32);
+                    Length {
+                        square: fades,
+                        ..length(k, fades, (k + 2) as f64)
+                    }
+                })
                 .collect()
         };
         let cost = |n: usize| -> f64 {
