@@ -119,6 +119,14 @@ results: build $(VENV)/.studies ## docs/results.md and its CSV from a study of o
 	$(BIN)/python -m pssflow study guides $(RESULTS_SCENES) --guides $(RESULTS_GUIDES) $(RESULTS_OPTIONS) -o out/results
 	$(BIN)/python -m pssflow study results out/results -o docs/results.md
 
+.PHONY: study-light
+study-light: build $(VENV)/.studies ## whole images against Mitsuba's path at the same depth: an hour, out/study-light; resumes
+	$(BIN)/python -m pssflow study light -o out/study-light
+
+.PHONY: study-gradients
+study-gradients: build ## variance of gradients against uniform numbers at equal time: 20 minutes, out/study-gradients; resumes
+	$(BIN)/python -m pssflow study gradients -o out/study-gradients
+
 .PHONY: study-stability
 study-stability: build ## planted failures with every guide: what holds, degrades or fails; out/study-stability; resumes
 	$(BIN)/python -m pssflow study stability -o out/study-stability

@@ -27,22 +27,35 @@ class Guide:
     @staticmethod
     def fit(
         name: str,
-        u: F32,
-        f: F32,
+        records: dict[str, Any],
         *,
-        f_max: F32 | None = None,
-        f_bsdf: F32 | None = None,
-        ray: F32 | None = None,
-        g: F32 | None = None,
-        zeros: int = 0,
-        contexts: dict[str, NDArray[Any]] | None = None,
-        pixel: F32 | None = None,
-        emitters: list[tuple[float, bool]] = ...,
         options: str = "{}",
         seed: int = 0,
         progress: Callable[[str, float], None] | None = None,
     ) -> Guide:
-        """Fits guide `name` to numbers `u` (n, d) with contributions `f` (n,) drawn from density `g` (n,)."""
+        """Fits guide `name` to paths, of which only those that carry light need be given.
+
+        `records` holds float32 arrays: u (n, d) numbers, f (n,) contributions or whatever else the paths shall weigh,
+        and, each of which may be missing or None, f_bsdf (n,) the part of f that the numbers of emitter and light do
+        not decide, f_max (n,) its largest component, ray (n, 2) the numbers of the BSDF-sampled ray, g, g_bsdf, g_both
+        (n,) densities of the numbers that f_nee and f_bsdf use and of all, pixel (n, 2) in [0, 1)², contexts, a
+        dictionary of arrays with a row for each vertex, emitters, a list of (upper end of its interval, whether it
+        surrounds the scene), and zeros, the number of paths that are not given.
+        """
+    @staticmethod
+    def learn(
+        name: str,
+        records: dict[str, Any],
+        *,
+        paths: float,
+        found: float,
+        options: str = "{}",
+        seed: int = 0,
+    ) -> tuple[Guide, float] | None:
+        """A guide by name, or what `auto` chooses, and its share of uniform paths; None where nothing pays.
+
+        `paths` are still to be drawn, of which a share `found` has all its vertices. `records` as in `fit`.
+        """
     @staticmethod
     def load(
         path: str, columns_hash: str | None = None, scene_hash: str | None = None
@@ -140,9 +153,13 @@ class Scene:
         *,
         spp: float,
         parametrisation: str,
+        rr_depth: int | None = None,
         threads: int = 0,
     ) -> str:
-        """JSON, for each (k, emitter strategy): k, variance, rays, lit, mean, and the samples per pixel of `spp`."""
+        """JSON, for each (k, emitter strategy): k, variance, square, rays, lit, mean, and samples per pixel of `spp`.
+
+        With `rr_depth` these halve with each bounce from there on.
+        """
     def draw(
         self,
         guide: Guide | None = None,
@@ -155,13 +172,15 @@ class Scene:
         emitter_strategy: str,
         seed: int = 0,
         threads: int = 0,
+        numbers: bool = False,
     ) -> dict[str, NDArray[Any]]:
         """Draws `spp` paths a pixel as a pass does, rows, pixels and samples in order.
 
         Returns what `trace` returns, and film (n,2) in pixels from the crop's corner, lens (n,2) or (0,2), m_nee (n,),
         m_bsdf (n,); step_d (n,k,3) directions at x₁ … x_{k-1} and of the BSDF ray at x_k, step_weight (n,k,3)
         f_s·|cos θ| ÷ pdf, step_pdf (n,k), 0 for delta lobes; join_d (n,3), join_scale (n,) w_nee ÷ p_nee, 0 where no
-        light was joined; mis (n,) w_bsdf, 0 where the ray met no light.
+        light was joined; mis (n,) w_bsdf, 0 where the ray met no light. With `numbers` also u (n,d) and m_both (n,),
+        the density of all of them.
         """
     def render(
         self,
@@ -176,11 +195,12 @@ class Scene:
          "guide_options": {...}, "k": 2 (0: emission), "parametrisation": "bsdf|cosine|uniform",
          "emitter_strategy": "mis|nee", "spp": N or null, "time": seconds or null,
          "snapshots": [shorter times], "replay": [passes of a record] or null,
-         "uniform_fraction": a or null, "pilot_spp": n or null, "keep_pilot": true,
+         "survival": probability that a path is traced, "uniform_fraction": a or null,
+         "pilot_spp": n or null, "keep_pilot": true,
          "combine": "samples|variance", "seed": 0, "threads": 0}
 
-        "guide_options", "spp", "time", "snapshots", "replay", "uniform_fraction", "pilot_spp" and "combine" may be left
-        out; one of spp, time and replay must be there.
+        "guide_options", "spp", "time", "snapshots", "replay", "survival", "uniform_fraction", "pilot_spp" and "combine"
+        may be left out; one of spp, time and replay must be there.
 
         A pass is {"kind": "pilot|guided|uniform", "spp": samples per pixel, "record": share of the light-carrying
         paths kept for training, "fit": whether the guide was fitted anew before it}, and if guided also {"guide": name

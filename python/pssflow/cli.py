@@ -36,6 +36,7 @@ RECORDED = (
     *(
         "--k",
         "--max-depth",
+        "--rr-depth",
         "--parametrisation",
         "--emitter-strategy",
         "--uniform-fraction",
@@ -183,6 +184,11 @@ def _render_options(command: F) -> F:
     "--max-depth",
     type=int,
     help="All light up to this depth, as Mitsuba counts it (1: emission, 2: and direct light), in place of --k.",
+)
+@click.option(
+    "--rr-depth",
+    type=int,
+    help="With --max-depth, bounces from which on long paths are left to chance.  [default: none]",
 )
 @click.option("--explain", is_flag=True, help="Print what `auto` considered, and why.")
 @click.option("--replay", metavar="RESULT.json", help="Repeat the recorded run, bit for bit.")
@@ -510,6 +516,7 @@ def _arguments(options: Mapping[str, Any]) -> dict[str, Any]:
             "spp",
             "k",
             "max_depth",
+            "rr_depth",
             "parametrisation",
             "uniform_fraction",
             "emitter_strategy",

@@ -11,6 +11,9 @@ by Mitsuba's own ray tracing, and
 derivative is unbiased for every parameter that moves no geometry, whatever the guide, since m ≥ a > 0. What moves
 geometry is refused by name: its discontinuities need other estimators.
 
+The guides are the render's, which learned where light comes from. With a `Target` (`pssflow.gradient_guides`) others
+are learned first, from where the derivative is large.
+
 Where a lobe is a delta its weight is a constant, as in Mitsuba's `prb`; parameters of such lobes are refused too. Paths
 go on where a surface reflects nothing, since it has a derivative all the same; `prb` ends them there.
 Paths are drawn and differentiated a few samples at a time, so that memory does not grow with their number; one sample
@@ -27,20 +30,18 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .guide import Guide
-from .jit import columns, to_jit
+from .gradient_guides import Target, learned
+from .jit import to_jit
+from .rebuild import draw, radiance, sources
 
 if TYPE_CHECKING:
     from .render import Result
     from .scene import Scene
 
-__all__ = ["backward", "check_parameters", "forward", "sources"]
+__all__ = ["backward", "check_parameters", "forward"]
 
 MOST_AT_ONCE = 1 << 17
 """Paths that are differentiated together."""
-
-MOST_GRAZED = 2
-"""Surfaces in the plane of a light that are passed on the way to it."""
 
 GEOMETRY = (
     *("vertex_positions", "vertex_normals", "vertex_texcoords", "faces", "to_world", "to_uv"),
@@ -86,26 +87,20 @@ def check_parameters(scene: Any, params: Any) -> None:
             )
 
 
-def sources(result: Result) -> list[tuple[int, Guide | None, float, str]]:
-    """What is drawn from: (k, guide, a, emitter strategy) of each length of a result."""
-    lengths = result.parts or (result,)
-    found: list[tuple[int, Guide | None, float, str]] = []
-    for part in lengths:
-        guide = part.guide if isinstance(part.guide, Guide) else None
-        a = float(part.stats["a"]) if guide is not None else 1.0
-        if a <= 0.0:
-            raise ValueError(
-                "gradients need a uniform_fraction above 0: without uniform paths they may be biased"
-            )
-        found.append((part.stats["k"], guide, a, part.stats["emitter_strategy"]))
-    return found
-
-
 def backward(
-    ours: Scene, result: Result, sensor: Any, grad: Any, seed: int, spp: int, parametrisation: str
+    ours: Scene,
+    result: Result,
+    sensor: Any,
+    grad: Any,
+    seed: int,
+    spp: int,
+    parametrisation: str,
+    target: Target | None = None,
 ) -> None:
     """Propagates the gradient of an image (H, W, C) to the scene's parameters; see `forward`."""
-    for image, share in _images(ours, result, sensor, seed, spp, parametrisation):
+    for image, share in _images(
+        ours, result, sensor, seed, spp, parametrisation, target, np.array(grad)
+    ):
         if not dr.grad_enabled(image):
             continue  # light of this length does not depend on the parameters
         dr.set_grad(image, grad * share)
@@ -115,7 +110,13 @@ def backward(
 
 
 def forward(
-    ours: Scene, result: Result, sensor: Any, seed: int, spp: int, parametrisation: str
+    ours: Scene,
+    result: Result,
+    sensor: Any,
+    seed: int,
+    spp: int,
+    parametrisation: str,
+    target: Target | None = None,
 ) -> Any:
     """The derivative of the image (H, W, C) along the gradients that the scene's parameters have.
 
@@ -124,11 +125,15 @@ def forward(
         result: a render, whose guides draw.
         sensor: Mitsuba's sensor.
         seed: of the paths; another one than the render's.
-        spp: samples per pixel, of each length.
+        spp: samples per pixel, of each length; with `target` its pilot is inside.
         parametrisation: of directions, as in `render`.
+        target: learns from the derivative before it draws; None for the render's guides, which learned from radiance.
+
+    Raises:
+        ValueError: what cannot be differentiated; one line.
     """
     total = None
-    for image, share in _images(ours, result, sensor, seed, spp, parametrisation):
+    for image, share in _images(ours, result, sensor, seed, spp, parametrisation, target):
         # The parameters' own gradients stay: later passes need them, too.
         kept = dr.ADFlag.ClearEdges | dr.ADFlag.ClearInterior | dr.ADFlag.AllowNoGrad
         dr.forward_to(image, flags=kept)
@@ -139,9 +144,19 @@ def forward(
 
 
 def _images(
-    ours: Scene, result: Result, sensor: Any, seed: int, spp: int, parametrisation: str
+    ours: Scene,
+    result: Result,
+    sensor: Any,
+    seed: int,
+    spp: int,
+    parametrisation: str,
+    target: Target | None,
+    grad: Any = None,
 ) -> Iterator[tuple[Any, float]]:
-    """Developed images with their graph, one a pass and length, and the share of the estimate that each is."""
+    """Developed images with their graph, one a pass and length, and the share of the estimate that each is.
+
+    `grad` is what they will be differentiated with, or None in forward mode.
+    """
     scene = ours.mi_scene
     if ours.hide_emitters:
         raise ValueError("gradients are not supported with `hide_emitters`")
@@ -157,21 +172,19 @@ def _images(
     pixels = int(np.prod(np.array(film.crop_size())))
     most = max(MOST_AT_ONCE // pixels, 1)
     emitters = to_jit(mi.UInt32, np.array(ours.exported.emitter_order or [0], np.uint32))
-    for k, guide, a, strategy in sources(result):
-        for first in range(0, spp, most):
-            n = min(most, spp - first)
-            drawn = ours.core.draw(
-                None if guide is None else guide.core,
-                uniform_fraction=a,
-                first_sample=first,
-                spp=n,
-                k=max(k, 1),
-                parametrisation=parametrisation,
-                emitter_strategy=strategy,
-                seed=(seed + k) % 2**64,
-            )
+    how: dict[str, Any] = {"seed": seed, "parametrisation": parametrisation}
+    for source in sources(result):
+        pilot = 0
+        if target is not None and source.k > 0:
+            pilot = target.pilot(spp)
+            passes = [range(i, min(i + most, pilot)) for i in range(0, pilot, most)]
+            left = (spp - pilot) * pixels
+            source = learned(target, ours, sensor, source, passes, emitters, grad, left, **how)
+        for first in range(pilot, spp, most):
+            samples = range(first, min(first + most, spp))
+            drawn = draw(ours, source, samples, **how)
             with dr.resume_grad():
-                value, at = radiance(scene, sensor, drawn, k, emitters)
+                value, at = radiance(scene, sensor, drawn, source.k, emitters)
                 film.prepare([])
                 block = film.create_block()
                 channels = [value.x, value.y, value.z, mi.Float(1.0)]
@@ -180,96 +193,7 @@ def _images(
                 block.put(at, channels)
                 film.put_block(block)
                 dr.schedule(block.tensor())
-                yield film.develop(), n / spp
-
-
-def radiance(
-    scene: Any, sensor: Any, drawn: dict[str, Any], k: int, emitters: Any
-) -> tuple[Any, Any]:
-    """F ÷ m of drawn paths with its graph, and where on the film they belong.
-
-    Args:
-        scene: Mitsuba's scene.
-        sensor: Mitsuba's sensor.
-        drawn: what `_core.Scene.draw` returned.
-        k: bounces; 0 for emission along the same camera rays.
-        emitters: position in `scene.emitters()` of each of the core's emitters.
-    """
-    film = sensor.film()
-    size, offset = (np.array(v, np.float32) for v in (film.crop_size(), film.crop_offset()))
-    place = np.minimum(drawn["film"] / size, np.float32(1 - 2**-24))
-    lens = drawn["lens"] if len(drawn["lens"]) else np.full_like(place, 0.5)
-    at = drawn["film"] + offset
-    if film.rfilter().is_box_filter():
-        at = np.floor(at)
-    ctx = mi.BSDFContext()
-    active = to_jit(mi.Float, drawn["found"].astype(np.float32)) > 0.0 if k > 0 else mi.Bool(True)
-    ray, ray_weight = sensor.sample_ray_differential(
-        sensor.shutter_open(), 0.0, _vector(place, mi.Point2f), _vector(lens, mi.Point2f)
-    )
-    with dr.suspend_grad():
-        si = scene.ray_intersect(ray, mi.RayFlags.All, True, active)
-    if k == 0:
-        value = si.emitter(scene).eval(si)
-        return value * ray_weight, _vector(at, mi.Point2f)
-
-    # ---------------------- x₁ → … → x_k ----------------------
-    throughput = mi.Spectrum(ray_weight)
-    for b in range(k - 1):
-        active &= si.is_valid()
-        d, factor = _step(ctx, si, drawn, b, active)
-        throughput *= factor
-        with dr.suspend_grad():
-            si = scene.ray_intersect(si.spawn_ray(d), mi.RayFlags.All, False, active)
-    active &= si.is_valid()
-
-    # ------------------- Emitter sample at x_k -----------------
-    scale = to_jit(mi.Float, drawn["join_scale"] / drawn["m_nee"])
-    joined = active & (scale > 0.0)
-    d = _vector(drawn["join_d"], mi.Vector3f)
-    value = si.bsdf().eval(ctx, si, si.to_local(d), joined)
-    chosen = dr.gather(mi.UInt32, emitters, to_jit(mi.UInt32, drawn["emitter"]), joined)
-    light = dr.gather(mi.EmitterPtr, scene.emitters_dr(), chosen, joined)
-    delta = joined & mi.has_flag(light.flags(), mi.EmitterFlags.Delta)
-    met = joined & ~delta
-    with dr.suspend_grad():
-        there = scene.ray_intersect(si.spawn_ray(d), mi.RayFlags.All, False, met)
-        for _ in range(MOST_GRAZED):
-            # Nothing lies before the light, but a surface may lie in it, as a ceiling with its lamp.
-            other = met & (there.emitter(scene, met) != light)
-            further = scene.ray_intersect(there.spawn_ray(d), mi.RayFlags.All, False, other)
-            there = dr.select(other, further, there)
-    # What still lies before the light is another one, whose light is not that of the sample.
-    met &= there.emitter(scene, met) == light
-    seen = there.emitter(scene, met).eval(there, met)
-    # Nothing is chosen on a point or a direction: its numbers do not matter.
-    _, given = light.sample_direction(si, mi.Point2f(0.5), delta)
-    found = throughput * value * dr.select(delta, given, seen) * scale
-    result = dr.select(joined, found, 0.0)
-
-    # --------------------- BSDF sample at x_k ------------------
-    scale = to_jit(mi.Float, drawn["mis"] / drawn["m_bsdf"])
-    met = active & (scale > 0.0)
-    d, factor = _step(ctx, si, drawn, k - 1, met)
-    with dr.suspend_grad():
-        there = scene.ray_intersect(si.spawn_ray(d), mi.RayFlags.All, False, met)
-    seen = there.emitter(scene, met).eval(there, met)
-    result += dr.select(met, throughput * factor * seen * scale, 0.0)
-    return dr.select(dr.all(dr.isfinite(result)), result, 0.0), _vector(at, mi.Point2f)
-
-
-def _step(ctx: Any, si: Any, drawn: dict[str, Any], b: int, active: Any) -> tuple[Any, Any]:
-    """A direction that was drawn at x_{b+1}, and f_s·|cos θ| ÷ p with its graph."""
-    d = _vector(drawn["step_d"][:, b], mi.Vector3f)
-    pdf = to_jit(mi.Float, drawn["step_pdf"][:, b])
-    weight = _vector(drawn["step_weight"][:, b], mi.Spectrum)
-    smooth = active & (pdf > 0.0)
-    value = si.bsdf().eval(ctx, si, si.to_local(d), smooth)
-    return d, dr.select(smooth, value / dr.select(smooth, pdf, 1.0), weight)
-
-
-def _vector(values: Any, kind: Any) -> Any:
-    return columns(kind, mi.Float, values)
+                yield film.develop(), len(samples) / (spp - pilot)
 
 
 def _has_delta(bsdf: Any) -> bool:

@@ -41,6 +41,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from . import _core
 from .options import DEFAULT_GUIDE, PRESETS, check_integer
+from .rows import matrix, places, records
 
 __all__ = [
     "Choice",
@@ -57,9 +58,6 @@ __all__ = [
 F32 = NDArray[np.float32]
 
 MAX_SEED = 2**64 - 1
-
-LUMINANCE = np.array([0.212671, 0.715160, 0.072169], np.float32)
-"""Weights of linear sRGB in a luminance, as Mitsuba has them."""
 
 
 @runtime_checkable
@@ -156,38 +154,12 @@ class Guide:
         Raises:
             ValueError: an unknown name or option, wrong shapes, values out of range, too few paths.
         """
-        u = _rows(u)
-        rgb = np.asarray(f, np.float32)
-        if rgb.shape not in ((len(u),), (len(u), 3)):
-            raise ValueError(f"`f` has shape {rgb.shape}; expected ({len(u)},) or ({len(u)}, 3)")
-        luminance = _luminance(rgb)
-        largest = rgb.max(axis=1) if rgb.ndim == 2 else rgb
-        # NaN is no zero: it goes on to the core, which counts and drops it.
-        lit = ~(largest == 0.0)
-        density = np.ones(len(u), np.float32) if g is None else np.asarray(g, np.float32)
-        if density.shape != (len(u),):
-            raise ValueError(f"`g` has shape {density.shape}; expected ({len(u)},)")
-        term = None if f_bsdf is None else _luminance(np.asarray(f_bsdf, np.float32))
-        if term is not None and term.shape != (len(u),):
-            raise ValueError(f"`f_bsdf` has shape {term.shape}; expected that of `f`")
-        last = None if ray is None else _rows(ray)
-        if last is not None and last.shape != (len(u), 2):
-            raise ValueError(f"`ray` has shape {last.shape}; expected ({len(u)}, 2)")
-        if contexts is not None:
-            contexts = _of_paths(contexts, len(u))
-        pixel = None if contexts is None else contexts.get("pixel")
+        rows = records(
+            u, f, f_bsdf=f_bsdf, ray=ray, g=g, zeros=zeros, contexts=contexts, emitters=emitters
+        )
         core = _core.Guide.fit(
             name,
-            np.ascontiguousarray(u[lit]),
-            np.ascontiguousarray(luminance[lit]),
-            f_max=np.ascontiguousarray(largest[lit]),
-            f_bsdf=None if term is None else np.ascontiguousarray(term[lit]),
-            ray=None if last is None else np.ascontiguousarray(last[lit]),
-            g=np.ascontiguousarray(density[lit]),
-            contexts=None if contexts is None else _vertices(contexts, lit),
-            pixel=None if pixel is None else _rows(np.asarray(pixel)[lit]),
-            emitters=[] if emitters is None else _intervals(emitters),
-            zeros=check_integer("zeros", zeros, 0, 2**63) + int(np.count_nonzero(~lit)),
+            rows,
             options=options_json(_by_part(name, options)),
             seed=check_integer("seed", seed, 0, MAX_SEED),
             progress=progress,
@@ -242,7 +214,7 @@ class Guide:
         """
         rows = check_integer("n", n, 0, 2**40)
         seed = check_integer("seed", seed, 0, MAX_SEED)
-        return self.core.sample(rows, seed, decision, _places(contexts))
+        return self.core.sample(rows, seed, decision, places(contexts))
 
     def log_prob(
         self,
@@ -256,10 +228,10 @@ class Guide:
         Raises:
             ValueError: `u` has another number of columns, or as `sample`.
         """
-        u = _rows(u)
+        u = matrix(u)
         if decision == "path" and "path" in self.models and u.shape[1] != self.dims:
             raise ValueError(f"`u` has {u.shape[1]} columns; this guide has {self.dims}")
-        return self.core.log_prob(u, decision, _places(contexts))
+        return self.core.log_prob(u, decision, places(contexts))
 
     def cells(
         self, contexts: Mapping[str, ArrayLike], *, decision: str = "direction"
@@ -271,9 +243,9 @@ class Guide:
         Raises:
             ValueError: the guide does not model the decision, or the arrays differ in length.
         """
-        places = _places(contexts) or {}
-        rows = len(next(iter(places.values()), ()))
-        return self.core.cells(rows, decision, places)
+        where = places(contexts) or {}
+        rows = len(next(iter(where.values()), ()))
+        return self.core.cells(rows, decision, where)
 
     @property
     def models(self) -> list[str]:
@@ -444,77 +416,6 @@ def _by_part(guide: str, options: Mapping[str, Any]) -> dict[str, Any]:
     return by_part[parts[0]] if len(parts) == 1 else by_part
 
 
-def _intervals(emitters: ArrayLike) -> list[tuple[float, bool]]:
-    array = np.asarray(emitters, np.float32)
-    if array.ndim != 2 or array.shape[1] != 2:
-        raise ValueError(f"`emitters` has shape {array.shape}; expected (m, 2)")
-    return [(float(end), bool(surrounds)) for end, surrounds in array]
-
-
-def _luminance(values: F32) -> F32:
-    return values @ LUMINANCE if values.ndim == 2 else values
-
-
-def _of_paths(contexts: Mapping[str, ArrayLike], n: int) -> dict[str, NDArray[Any]]:
-    """Contexts of n whole paths as arrays.
-
-    Raises:
-        ValueError: one is missing that tells the number of vertices, or has another shape.
-    """
-    if "position" not in contexts:
-        raise ValueError(
-            "`contexts` holds no `position`, (n, k, 3), which tells how many vertices there are"
-        )
-    vertices = ("position", "normal", "outgoing")
-    arrays: dict[str, NDArray[Any]] = {
-        name: np.asarray(contexts[name], np.float32) for name in vertices if name in contexts
-    }
-    if "pixel" in contexts:
-        arrays["pixel"] = np.asarray(contexts["pixel"], np.float32)
-    if "emitter" in contexts:
-        emitter = np.asarray(contexts["emitter"])
-        if emitter.dtype.kind not in "iu":
-            raise ValueError(f"contexts['emitter'] holds {emitter.dtype}; expected integers")
-        arrays["emitter"] = emitter.astype(np.uint32)
-    k = arrays["position"].shape[1] if arrays["position"].ndim == 3 else 0
-    expected = {**dict.fromkeys(vertices, (n, k, 3)), "pixel": (n, 2), "emitter": (n,)}
-    for name, array in arrays.items():
-        if k == 0 or array.shape != expected[name]:
-            shape = str(expected[name]) if k else f"({n}, k, 3), k ≥ 1"
-            raise ValueError(f"contexts[{name!r}] has shape {array.shape}; expected {shape}")
-    return arrays
-
-
-def _vertices(contexts: Mapping[str, NDArray[Any]], rows: NDArray[np.bool_]) -> dict[str, Any]:
-    """Contexts of whole paths, (n, k, …), as one row a vertex; the emitter belongs to the last one."""
-    k = contexts["position"].shape[1]
-    n = int(np.count_nonzero(rows))
-    flat: dict[str, Any] = {
-        name: contexts[name][rows].reshape(n * k, 3)
-        for name in ("position", "normal", "outgoing")
-        if name in contexts
-    }
-    flat["bounce"] = np.tile(np.arange(1, k + 1, dtype=np.uint32), n)
-    if "pixel" in contexts:
-        flat["pixel"] = np.repeat(contexts["pixel"][rows], k, axis=0)
-    if "emitter" in contexts:
-        emitter = np.zeros((n, k), np.uint32)
-        emitter[:, -1] = contexts["emitter"][rows]
-        flat["emitter"] = emitter.ravel()
-    return flat
-
-
-def _places(contexts: Mapping[str, ArrayLike] | None) -> dict[str, Any] | None:
-    """Contexts of decisions, a row each, in the core's types."""
-    if contexts is None:
-        return None
-    whole = ("emitter", "bounce")
-    return {
-        name: np.ascontiguousarray(value, np.uint32 if name in whole else np.float32)
-        for name, value in contexts.items()
-    }
-
-
 def _known() -> str:
     return ", ".join(guide_names())
 
@@ -524,10 +425,3 @@ def _no_options(options: Mapping[str, Any], what: str) -> None:
         raise ValueError(
             f"`{next(iter(options))}` was given, but `guide` is {what} and takes no options"
         )
-
-
-def _rows(u: ArrayLike) -> F32:
-    array = np.ascontiguousarray(u, np.float32)
-    if array.ndim != 2:
-        raise ValueError(f"`u` has shape {array.shape}; expected two axes, a row for each sample")
-    return array

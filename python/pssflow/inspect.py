@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .guide import LUMINANCE, Guide
+from .guide import Guide
 from .options import check_integer
 from .render import Result
+from .rows import LUMINANCE
 from .scene import Scene
 
 __all__ = ["AtPixel", "Fitted", "ImageMaps", "MapRow", "at_pixel", "over_image"]

@@ -3,6 +3,9 @@
 Each length has a guide of its own and its own samples: of a budget it gets what a probe of uniform paths says lowers
 the error most (`rust/pssflow/src/lengths.rs`). The shares are fixed before sampling and no path of the probe is in the
 image, so the sum is as unbiased as its parts. Each part is a render that can be replayed; so can the sum.
+
+With `rr_depth` long paths, from that many bounces on, may get less than one sample a pixel: of four samples each is
+traced with probability s and then counts 1 ÷ s, which is Russian roulette before the first ray.
 """
 
 from __future__ import annotations
@@ -16,18 +19,23 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from . import _core, metrics
-from .guide import LUMINANCE, Choice, choose
+from .guide import Choice, choose
 from .options import MAX_BOUNCES, Plan, check_integer
 from .progress import Listener, Progress, reporting
+from .rows import LUMINANCE
 
 if TYPE_CHECKING:
     from .render import Result
     from .scene import Scene
 
-__all__ = ["check_depth", "render_light", "share_layer"]
+__all__ = ["check_depth", "check_roulette", "render_light", "share_layer"]
 
 ODD = 0x9E3779B97F4A7C15
 """Distance of the seeds of two lengths: their paths must not repeat each other's numbers, or errors would add up."""
+
+
+LEAST_CHANCES = 4
+"""Samples per pixel that share what is left to chance, at least: of a single one no variance is known."""
 
 
 def check_depth(max_depth: Any, choice: Choice, plan: Plan, preset: str | None) -> int:
@@ -53,6 +61,21 @@ def check_depth(max_depth: Any, choice: Choice, plan: Plan, preset: str | None) 
     return depth
 
 
+def check_roulette(rr_depth: Any, max_depth: int | None) -> int | None:
+    """`rr_depth` as it is, if it can be used with this `max_depth`.
+
+    Raises:
+        ValueError: one line.
+    """
+    if rr_depth is None:
+        return None
+    if max_depth is None:
+        raise ValueError(
+            f"`rr_depth` = {rr_depth!r}: Russian roulette is for the whole light; give `max_depth`, or leave it out"
+        )
+    return check_integer("rr_depth", rr_depth, 1, MAX_BOUNCES + 1)
+
+
 @dataclass(frozen=True)
 class _Part:
     """A length to render."""
@@ -75,6 +98,7 @@ def render_light(
     max_depth: int,
     progress: Progress = True,
     records: Sequence[Mapping[str, Any]] | None = None,
+    rr_depth: int | None = None,
 ) -> Result:
     """Renders light of up to `max_depth` − 1 bounces with arguments that were checked already; see `render`.
 
@@ -85,21 +109,23 @@ def render_light(
         max_depth: as in Mitsuba: 1 for emission alone, 2 with direct light.
         progress: as in `render`.
         records: the lengths of an earlier run, whose passes are repeated; the budget is not looked at then.
+        rr_depth: bounces from which on paths may be left to chance; None for no roulette.
     """
     with reporting(progress) as listener:
         start = clock.perf_counter()
         if records is None:
-            parts, probed = _probe(scene, plan, max_depth), clock.perf_counter() - start
-            results = _by_budget(scene, choice, plan, parts, start, listener)
+            parts, probed = _probe(scene, plan, max_depth, rr_depth), clock.perf_counter() - start
+            results = _by_budget(scene, choice, plan, parts, rr_depth, start, listener)
             probes: list[Mapping[str, Any] | None] = [part.probe for part in parts]
         else:
             results, probed = _by_records(scene, choice, plan, records, listener), 0.0
             probes = [record.get("probe") for record in records]
         elapsed = clock.perf_counter() - start
-    return _sum(scene, choice, plan, max_depth, results, probes, (probed, elapsed))
+    depths = {"max_depth": max_depth, "rr_depth": rr_depth}
+    return _sum(scene, choice, plan, depths, results, probes, (probed, elapsed))
 
 
-def _probe(scene: Scene, plan: Plan, max_depth: int) -> list[_Part]:
+def _probe(scene: Scene, plan: Plan, max_depth: int, rr_depth: int | None) -> list[_Part]:
     # What is hidden from the camera has nothing to render at k = 0.
     first = 1 if scene.hide_emitters and max_depth > 1 else 0
     lengths = []
@@ -115,6 +141,7 @@ def _probe(scene: Scene, plan: Plan, max_depth: int) -> list[_Part]:
             lengths,
             spp=float(plan.spp or 1),
             parametrisation=plan.parametrisation,
+            rr_depth=rr_depth,
             threads=plan.threads,
         )
     )
@@ -126,6 +153,7 @@ def _by_budget(
     choice: Choice,
     plan: Plan,
     parts: Sequence[_Part],
+    rr_depth: int | None,
     start: float,
     listener: Listener | None,
 ) -> list[Result]:
@@ -138,12 +166,19 @@ def _by_budget(
         own = replace(
             plan, k=max(part.k, 0), emitter_strategy=part.strategy, seed=_seed(plan, part.k)
         )
+        chance = rr_depth is not None and part.k >= rr_depth
         if plan.time is None:
-            own = replace(own, spp=max(round(part.probe["spp"]), 1))
+            wanted = part.probe["spp"]
+            own = replace(own, spp=max(round(wanted), 1))
+            own = _left_to_chance(own, wanted) if chance else own
         else:
             # What a part leaves or takes too much is shared by those after it.
             left = max(plan.time - (clock.perf_counter() - start), 1e-3)
-            own = replace(own, time=max(left * part.cost / max(total - done, 1e-9), 1e-3))
+            share = max(left * part.cost / max(total - done, 1e-9), 1e-3)
+            own = replace(own, time=share)
+            if chance and results:
+                rays = part.probe["rays"] * scene.width * scene.height
+                own = _left_to_chance(own, share * _speed(parts, results) / rays)
         guide = choice
         if part.k == 0 or _too_few(choice, own):
             guide = choose("none", {})
@@ -171,6 +206,7 @@ def _by_records(
             k=record["k"],
             emitter_strategy=record["emitter_strategy"],
             seed=record["seed"],
+            survival=record["survival"],
             uniform_fraction=record["a"],
             replay=[dict(entry) for entry in record["passes"]],
             spp=None,
@@ -180,6 +216,24 @@ def _by_records(
         span = (i / len(records), (i + 1) / len(records))
         results.append(run(scene, guide, own, _within(listener, span)))
     return results
+
+
+def _left_to_chance(plan: Plan, wanted: float) -> Plan:
+    """With few samples per pixel wanted, more of them, each with so small a chance that they cost as much.
+
+    Which pixels have one varies, and so costs a little of what it saves: from two on, numbers are rounded.
+    """
+    if wanted >= 0.5 * LEAST_CHANCES:
+        return plan
+    spp = None if plan.spp is None else LEAST_CHANCES
+    return replace(plan, spp=spp, survival=wanted / LEAST_CHANCES)
+
+
+def _speed(parts: Sequence[_Part], results: Sequence[Result]) -> float:
+    """Rays a second of what was rendered so far."""
+    done = list(zip(parts, results, strict=False))
+    rays = sum(result.stats["camera_rays"] * part.probe["rays"] for part, result in done)
+    return rays / max(sum(result.stats["seconds"]["render"] for _, result in done), 1e-9)
 
 
 def _too_few(choice: Choice, plan: Plan) -> bool:
@@ -218,7 +272,7 @@ def _sum(
     scene: Scene,
     choice: Choice,
     plan: Plan,
-    max_depth: int,
+    depths: Mapping[str, int | None],
     parts: Sequence[Result],
     probes: Sequence[Mapping[str, Any] | None],
     seconds: tuple[float, float],
@@ -243,7 +297,10 @@ def _sum(
         lengths.append(record | told | {"probe": None if probe is None else dict(probe)})
     counts = {name: sum(record[name] for record in stats) for name in COUNTS}
     guided = [record for record in stats if record["chosen"] != "none"]
-    heaviest = [record["max_contribution"] * _luminance(record["mean"]) for record in stats]
+    heaviest = [
+        record["max_contribution"] * _luminance(record["mean"]) / record["survival"]
+        for record in stats
+    ]
     brightness = _luminance(mean)
     # One sample of a length has no variance.
     known = image.any() and np.isfinite(variance).all()
@@ -257,7 +314,7 @@ def _sum(
         "chosen": ", ".join(f"k={r['k']}: {r['chosen']}" for r in guided) or "none",
         **counts,
         "nonzero_share": counts["nonzero"] / max(counts["paths_found"], 1),
-        "max_depth": max_depth,
+        **depths,
         "k": None,
         "a": min((r["a"] for r in guided), default=1.0),
         "parametrisation": plan.parametrisation,

@@ -91,6 +91,8 @@ class Plan:
     threads: int
     replay: list[dict[str, Any]] | None
     snapshots: tuple[float, ...] = ()
+    survival: float = 1.0
+    """Probability that a path is traced at all; see `light`."""
 
     @classmethod
     def make(
@@ -184,6 +186,7 @@ class Plan:
                 "time": self.time,
                 "snapshots": self.snapshots,
                 "replay": self.replay,
+                "survival": self.survival,
                 "uniform_fraction": self.uniform_fraction,
                 "pilot_spp": self.pilot_spp,
                 "keep_pilot": self.keep_pilot,
@@ -344,6 +347,8 @@ def read_replay(replay: str | os.PathLike[str] | Mapping[str, Any]) -> dict[str,
     told = {key: stats[key] for key in REPLAYED}
     if lengths:
         told["max_depth"] = check_integer("max_depth", stats.get("max_depth"), 1, MAX_BOUNCES + 1)
+        if stats.get("rr_depth") is not None:
+            told["rr_depth"] = check_integer("rr_depth", stats["rr_depth"], 1, MAX_BOUNCES + 1)
         told["lengths"] = [_length(length) for length in lengths]
     return told
 
@@ -357,6 +362,7 @@ def _length(record: Mapping[str, Any]) -> dict[str, Any]:
         "passes": check_passes(record["passes"]),
         "k": check_integer("k", record["k"], 0, MAX_BOUNCES),
         "seed": check_integer("seed", record["seed"], 0, 2**64 - 1),
+        "survival": check_number("survival", record.get("survival", 1.0), 0.0, 1.0, above=True),
         "a": check_number("a", record["a"], 0.0, 1.0),
         "emitter_strategy": check_choice(
             "emitter_strategy", record["emitter_strategy"], EMITTER_STRATEGIES

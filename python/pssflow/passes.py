@@ -108,20 +108,24 @@ class KBouncePass(Pass):
 
 
 class AllLightPass(Pass):
-    """One pass of Mitsuba's `path` as everyone uses it: all light, of any number of bounces, Russian roulette from its
-    own default depth on.
+    """One pass of Mitsuba's `path` as everyone uses it: all light, Russian roulette from its own default depth on.
 
     Args:
         scene: an `mi.Scene` of the active variant.
         sensor: index of the sensor, or a sensor object.
         hide: as in `TruthPass`.
+        max_depth: as `path` has it: longest path, -1 for no end.
     """
 
     name = "Mitsuba path, all light"
 
-    def __init__(self, scene: Any, sensor: Any, *, hide: bool) -> None:
+    def __init__(self, scene: Any, sensor: Any, *, hide: bool, max_depth: int = -1) -> None:
         super().__init__(scene, sensor)
-        self.integrator = mi.load_dict({"type": "path", "max_depth": -1, "hide_emitters": hide})
+        if max_depth != -1:
+            self.name = f"{self.name} to depth {max_depth}"
+        self.integrator = mi.load_dict(
+            {"type": "path", "max_depth": max_depth, "hide_emitters": hide}
+        )
 
     def _render(self, seed: int, spp: int) -> F64:
         return self._image(self.integrator, seed, spp)

@@ -126,6 +126,7 @@ def reference(
     progress: Progress = True,
     cache: str | Path | bool | None = None,
     all_light: bool = False,
+    max_depth: int = -1,
 ) -> Reference:
     """Renders Mitsuba's truth for light of exactly k bounces, or adds what is missing to a cached one.
 
@@ -141,7 +142,8 @@ def reference(
         seed0: seed of the first pass.
         progress: as in `pssflow.render`; the phase is "reference".
         cache: a folder; None for `default_cache()`, False for none. Files are named by scene, k, size and crop.
-        all_light: the whole image by `path` of unlimited depth instead, whatever `k` says.
+        all_light: the whole image by `path` instead, whatever `k` says.
+        max_depth: of that image, as `path` has it: longest path, -1 for no end.
 
     Raises:
         UnsupportedError, FileNotFoundError: as `pssflow.render`.
@@ -171,7 +173,7 @@ def reference(
     )
     hide = bool(exported.description["hide_emitters"])
     if all_light:
-        k, renderer = 0, AllLightPass(mi_scene, camera, hide=hide)
+        k, renderer = 0, AllLightPass(mi_scene, camera, hide=hide, max_depth=max_depth)
     elif is_jit(mi_scene) and not hide:
         renderer = KBouncePass(mi_scene, camera, k)
     else:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from . import _core, metrics
 from .guide import Choice, ForeignGuide, Guide, choose, usual_guide
-from .light import check_depth, render_light
+from .light import check_depth, check_roulette, render_light
 from .options import Plan, read_replay
 from .progress import Progress, reporting
 from .scene import Pilot, Scene, SceneLike, Trace
@@ -103,6 +103,7 @@ def render(
     replay: Replay | None = None,
     snapshots: Sequence[float] = (),
     max_depth: int | None = None,
+    rr_depth: int | None = None,
     **guide_options: Any,
 ) -> Result:
     """Renders the light that reaches the eye after exactly k reflections: pilot → fit → render.
@@ -149,6 +150,8 @@ def render(
             object of your own is fitted anew for each length, k = 1 first, and knows the last one afterwards.
             `stats["lengths"]` holds a record for each; in that of the whole `k`, `ess`, `diagnostics`, `candidates` and
             `training` are None, `passes` is empty, and `pilot` is missing.
+        rr_depth: with `max_depth`, bounces from which on long paths are left to chance, 1 … 33: their samples halve
+            with each bounce, and may be less than one to a pixel. None: all lengths have one or more.
         **guide_options: the guide's own, as `epochs=7`; in a composite also `**{"realnvp.epochs": 7}`.
 
     Returns:
@@ -185,7 +188,10 @@ def render(
         if isinstance(replay, (str, os.PathLike, Mapping)):
             replay = read_replay(replay)
             _check_replayed(replay, k, max_depth)
+            if rr_depth is not None:
+                raise ValueError("`rr_depth` was given, but `replay` repeats recorded passes")
             if "lengths" in replay:
+                rr_depth = replay.get("rr_depth")
                 guide, guide_options, replay, max_depth, records = _replayed_light(
                     replay, guide, settings
                 )
@@ -217,9 +223,10 @@ def render(
         raise ValueError(
             f"`{name}` was given beside a `Scene`, which has its own; make another `Scene`"
         )
+    roulette = check_roulette(rr_depth, max_depth)
     if max_depth is not None:
         depth = check_depth(max_depth, choice, plan, preset)
-        return render_light(scene, choice, plan, depth, progress, records)
+        return render_light(scene, choice, plan, depth, progress, records, roulette)
     return run(scene, choice, plan, progress)
 
 

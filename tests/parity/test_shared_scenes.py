@@ -11,6 +11,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from pssflow.scene import Scene
@@ -24,6 +25,7 @@ from pssflow.study.parity import (
     shared_plans,
     truth_runs,
 )
+from tests.support.runs import mitsuba_runs
 from tests.support.welch import ALPHA, welch_where_power
 
 pytestmark = [pytest.mark.stat, pytest.mark.timeout(1800)]
@@ -71,6 +73,24 @@ def test_random_numbers_give_mitsubas_mean(
     verdict = compare_means(_loaded(plan), plan, k)
     record |= {"p": verdict.p, "tiles": verdict.tiles, "without power": verdict.without_power}
     assert not math.isnan(verdict.p), verdict.explain()
+    assert verdict.p > ALPHA / 2, verdict.explain()
+    assert verdict.without_power <= verdict.tiles / 2, verdict.explain()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", [name for name in NAMES if "_cam" not in name])
+def test_all_light_has_mitsubas_mean(name: str, shared_scenes: Path) -> None:
+    """H0: the whole light to depth 4 by `auto` has the mean of Mitsuba's `path` to that depth."""
+    plan = _plan(name, shared_scenes)
+    scene = _loaded(plan)
+    truth = mitsuba_runs(scene.mi_scene, max_depth=4, seeds=range(16), spp=2 * plan.spp)
+    ours = np.stack(
+        [
+            scene.render("auto", plan.spp, max_depth=4, seed=seed, progress=False).image
+            for seed in range(1000, 1016)
+        ]
+    )
+    verdict = welch_where_power(truth, ours)
     assert verdict.p > ALPHA / 2, verdict.explain()
     assert verdict.without_power <= verdict.tiles / 2, verdict.explain()
 

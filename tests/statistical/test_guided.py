@@ -13,9 +13,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from pssflow.examples import guide_any_integrator
 from tests import scenes
 from tests.conftest import LLVM
-from tests.support.boxes import define_ambient
 from tests.support.named import load_named
 from tests.support.runs import integrator_runs
 from tests.support.welch import ALPHA, welch
@@ -28,7 +28,7 @@ NESTED: dict[str, Any] = {
     "direct": {"type": "direct"},
     "prb_basic": {"type": "prb_basic", "max_depth": 3},
     "volpath": {"type": "volpath", "max_depth": 4},
-    "ambient": {"type": "pssflow_test_ambient"},
+    "ambient": {"type": "pssflow_example_ambient"},
 }
 SPP = {"prb_basic": 64}
 
@@ -56,8 +56,7 @@ def _cases() -> list[Any]:
 def test_its_mean_is_the_integrators(name: str, nested: str, guide: str, artifacts: Path) -> None:
     """H0: equal means, the guide always used, a = .25, an eighth of the samples its pilot."""
     mi.set_variant(LLVM)
-    ambient = define_ambient()
-    mi.register_integrator("pssflow_test_ambient", lambda props: ambient(props))
+    guide_any_integrator.register_ambient()
     scene = load_named(name)
     spp = SPP.get(nested, 16)
     truth = integrator_runs(scene, NESTED[nested], seeds=range(RUNS), spp=4 * spp)

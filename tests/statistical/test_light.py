@@ -16,9 +16,9 @@ import pytest
 
 import pssflow
 from tests.conftest import LLVM
-from tests.support.named import SHIPPED, load_named
+from tests.support.named import HARD, SHIPPED, load_named
 from tests.support.runs import Runs, mitsuba_runs
-from tests.support.welch import ALPHA, welch
+from tests.support.welch import ALPHA, welch, welch_where_power
 
 pytestmark = [pytest.mark.stat, pytest.mark.timeout(600)]
 
@@ -65,3 +65,48 @@ def test_all_light_has_mitsubas_mean(name: str, depth: int, guide: str, artifact
     assert r.p > ALPHA / 2, r.explain(artifacts)
     assert r.has_power, r.explain(artifacts)
     assert welch(truth, np.float32(1.02) * ours).p < ALPHA / 2
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("name", "depth"), [*((name, 4) for name in HARD), ("door-ajar", 8)])
+def test_all_light_of_hard_scenes_has_mitsubas_mean(name: str, depth: int) -> None:
+    """H0: equal means; tiles that no larger tile gives power are counted, not tested."""
+    mi.set_variant(LLVM)
+    scene = load_named(name)
+    truth = mitsuba_runs(scene, max_depth=depth, seeds=range(RUNS), spp=256)
+    verdict = welch_where_power(truth, light_runs(scene, guide="auto", max_depth=depth, spp=128))
+    assert verdict.p > ALPHA / 2, verdict.explain()
+    assert verdict.without_power <= verdict.tiles / 2, verdict.explain()
+
+
+@pytest.mark.parametrize(
+    ("name", "depth", "rr_depth", "guide"),
+    [
+        ("furnace_sphere", 9, 2, "none"),
+        *(
+            pytest.param(*case, marks=pytest.mark.long)
+            for case in (
+                ("furnace_sphere", 9, 1, "table"),
+                ("white-room", 12, 2, "auto"),
+                ("glass_room", 10, 3, "auto"),
+                ("cornell-box", 8, 3, "table"),
+                ("open_sky", 6, 1, "auto"),
+            )
+        ),
+    ],
+)
+def test_roulette_loses_no_light(
+    name: str, depth: int, rr_depth: int, guide: str, artifacts: Path
+) -> None:
+    """H0: equal means where long paths are left to chance; with 2 % more, and of what they hold half, they are not."""
+    mi.set_variant(LLVM)
+    scene = load_named(name)
+    truth = mitsuba_runs(scene, max_depth=depth, seeds=range(RUNS), spp=128)
+    spp = 32 if guide == "none" else 96
+    ours = light_runs(scene, guide=guide, max_depth=depth, rr_depth=rr_depth, spp=spp)
+    r = welch(truth, ours)
+    assert r.p > ALPHA / 2, r.explain(artifacts)
+    assert r.has_power, r.explain(artifacts)
+    assert welch(truth, np.float32(1.02) * ours).p < ALPHA / 2
+    short = mitsuba_runs(scene, max_depth=rr_depth, seeds=range(RUNS), spp=128)
+    assert welch(truth, 0.5 * (short + ours)).p < ALPHA / 2

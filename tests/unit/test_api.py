@@ -466,7 +466,7 @@ def test_rows_of_zero_are_counted(furnace, monkeypatch):
     seen = {}
 
     def fit(*args: Any, **options: Any) -> str:
-        seen.update(options, u=args[1], f=args[2])
+        seen.update(options, **args[1])
         return "core"
 
     core = {

@@ -58,9 +58,10 @@ def test_make_help_lists_every_target() -> None:
             "study-speed-accuracy",
             "study-thesis",
             "study-capacity",
+            "study-gradients",
+            "study-light",
             "study-stability",
             "results",
-            "study-stability",
             "docs",
             "clean",
         )

@@ -13,6 +13,7 @@ import pytest
 import pssflow
 from pssflow import light
 from pssflow.cli import main
+from pssflow.options import Plan
 from tests import scenes
 
 XML = str(Path(__file__).parents[2] / "scenes" / "cornell-box" / "scene.xml")
@@ -241,3 +242,87 @@ def test_the_plugins_channels(llvm_variant):
 
 def _spp(part: pssflow.Result) -> int:
     return sum(entry["spp"] for entry in part.stats["passes"])
+
+
+# --- Russian roulette
+
+
+def test_long_paths_are_left_to_chance(scene):
+    """From the depth of roulette on there may be less than a sample a pixel; before it nothing is left to chance."""
+    stats = _render(scene, "none", spp=16, max_depth=12, rr_depth=3).stats
+    assert stats["rr_depth"] == 3
+    by_k = {length["k"]: length for length in stats["lengths"]}
+    assert sorted(by_k) == list(range(12))
+    for k, length in by_k.items():
+        expected = length["probe"]["spp"]
+        paths = 32 * 32 * length["spp"]
+        if k < 3:
+            assert length["survival"] == 1.0
+            assert length["camera_rays"] == paths
+            continue
+        if expected >= 2.0:
+            assert (length["survival"], length["spp"]) == (1.0, round(expected))
+            continue
+        assert length["spp"] == 4
+        assert length["spp"] * length["survival"] == pytest.approx(expected, rel=1e-5)
+        traced = length["camera_rays"]
+        spread = (paths * length["survival"] * (1.0 - length["survival"])) ** 0.5
+        assert abs(traced - paths * length["survival"]) <= 5.0 * spread
+    assert by_k[11]["survival"] < 0.1
+    cost = {k: length["camera_rays"] * length["probe"]["rays"] for k, length in by_k.items()}
+    assert sum(cost[k] for k in range(6, 12)) < 0.1 * sum(cost.values())
+
+
+def test_chance_goes_by_the_seed_alone(scene):
+    """One seed gives one image on any number of threads, and a record repeats it; another seed ends other paths."""
+    options: dict[str, Any] = {"spp": 4, "max_depth": 9, "rr_depth": 2, "seed": 5}
+    one, two = (_render(scene, "auto", threads=n, **options) for n in (1, 2))
+    np.testing.assert_array_equal(one.image, two.image)
+    record = json.loads(json.dumps(one.stats))
+    again = pssflow.render(scene, replay=record, progress=False)
+    np.testing.assert_array_equal(one.image, again.image)
+    assert again.stats["rr_depth"] == 2
+    ended = [
+        part.found == 0
+        for part in (one.parts[8], _render(scene, "auto", **options | {"seed": 6}).parts[8])
+    ]
+    assert ended[0].any()
+    assert (ended[0] != ended[1]).any()
+
+
+def _plan(time: float) -> Plan:
+    return Plan.make(learns=False, time=time)
+
+
+def test_by_time_the_chance_is_what_a_sample_is_worth(scene):
+    """Where there is no time for a sample of each length; with time enough nothing is left to chance."""
+    survival = {}
+    for time in (1e-3, 1e3):
+        parts = light._probe(scene, _plan(time), 9, 2)
+        one = pssflow.render(scene, "none", spp=1, k=1, progress=False)
+        speed = light._speed(parts, [one])
+        assert speed > 0.0
+        rays = parts[8].probe["rays"] * scene.width * scene.height
+        survival[time] = light._left_to_chance(_plan(time), time * speed / rays).survival
+    assert 0.0 < survival[1e-3] < survival[1e3] == 1.0
+    stats = _render(scene, "none", time=1e-3, max_depth=9, rr_depth=2).stats
+    assert stats["lengths"][1]["survival"] == 1.0
+    assert 0.0 < stats["lengths"][8]["survival"] < 0.5
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"max_depth": None, "rr_depth": 3}, "`rr_depth` = 3: Russian roulette is for the whole"),
+        ({"rr_depth": 0}, "`rr_depth` = 0: expected an integer between 1 and 33"),
+    ],
+)
+def test_roulette_without_a_depth_is_refused(scene, options, message):
+    with pytest.raises(ValueError, match=message):
+        _render(scene, "none", spp=1, **options)
+
+
+def test_a_record_decides_the_roulette(scene):
+    record = _render(scene, "none", spp=1, max_depth=3).stats
+    with pytest.raises(ValueError, match="`rr_depth` was given, but `replay` repeats"):
+        pssflow.render(scene, replay=record, rr_depth=2, progress=False)

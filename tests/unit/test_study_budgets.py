@@ -20,7 +20,7 @@ from pssflow.study.harness import Scenery
 from pssflow.study.methods import _counted, named_method
 from pssflow.study.report import publish, with_error
 from pssflow.study.results import _newest, document
-from pssflow.study.store import ALL, Store
+from pssflow.study.store import ALL, Row, Store
 from pssflow.study.summary import cells, choices, overall, reaches
 from tests import scenes
 from tests.unit.test_study_guides import study, synthetic
@@ -295,9 +295,11 @@ def test_results_say_wins_and_losses_and_how_they_were_measured(tmp_path, capfd)
     floor = done.floors()["scene 0", "none"]
     assert with_error(floor) in text.partition("## References")[2]
     assert "loss |" in text
-    assert Store(target.with_suffix(".csv")).rows == rows
+    assert Store(target.with_suffix(".csv"), Row).rows == rows
     # From its own CSV alone the same, but for what the images say.
-    again = document(Store(target.with_suffix(".csv")).rows, tmp_path / "nowhere", "results.csv")
+    again = document(
+        Store(target.with_suffix(".csv"), Row).rows, tmp_path / "nowhere", "results.csv"
+    )
     assert "Bias was not tested" in again
     errors = [t.partition("## Errors")[2].partition("## References")[0] for t in (again, text)]
     assert errors[0] == errors[1]
@@ -314,7 +316,7 @@ def test_results_take_the_newest_settings_only(tmp_path, capfd):
     assert main(["study", "results", str(tmp_path), "-o", str(tmp_path / "page.md")]) == 0
     assert "6 rows of other settings" in capfd.readouterr().err
     assert not target.exists()
-    assert Store(tmp_path / "page.csv").rows == kept
+    assert Store(tmp_path / "page.csv", Row).rows == kept
 
 
 def test_results_mix_no_settings_and_no_films(tmp_path):

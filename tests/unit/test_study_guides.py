@@ -15,7 +15,7 @@ from pssflow.reference import Reference, read_exr
 from pssflow.study import harness, report
 from pssflow.study.harness import Case, Method, Scenery, Shot, Study
 from pssflow.study.report import biased, publish
-from pssflow.study.store import Row, Store
+from pssflow.study.store import Row, Store, parse
 from pssflow.study.summary import Cell, cells, choices, overall, reaches, time_to_reach
 
 ROOT = Path(__file__).parents[2]
@@ -180,7 +180,7 @@ def test_finished_runs_are_kept_and_not_run_again(tmp_path):
     first.publish = lambda rows: published.append(len(rows))
     with pytest.raises(KeyboardInterrupt):
         first.run()
-    assert len(Store(tmp_path / "results.csv").rows) == 8
+    assert len(Store(tmp_path / "results.csv", Row).rows) == 8
     assert published == [6, 8]
     rows = study(tmp_path, counted(synthetic("none")), scenes=2).run()
     assert len(calls) == 6
@@ -338,12 +338,12 @@ def test_a_method_of_half_the_variance_is_there_in_half_the_time(tmp_path):
 
 def test_rows_come_back_as_they_were(tmp_path):
     rows = study(tmp_path, synthetic("none"), scenes=1, seeds=1).run()
-    assert Store(tmp_path / "results.csv").rows == rows
+    assert Store(tmp_path / "results.csv", Row).rows == rows
     (tmp_path / "results.csv").write_text("a,b\n1,2\n")
     with pytest.raises(ValueError, match="is no table of this version"):
-        Store(tmp_path / "results.csv")
+        Store(tmp_path / "results.csv", Row)
     with pytest.raises(ValueError, match="column `scene` is missing"):
-        Row.parse({})
+        parse(Row, {})
 
 
 def test_tables_and_charts_are_written(tmp_path, slowly):

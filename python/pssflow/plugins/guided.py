@@ -66,10 +66,11 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..guide import LUMINANCE, Guide, registry
+from ..guide import Guide, registry
 from ..jit import columns as jit_columns
 from ..jit import to_jit
 from ..options import check_integer, check_number
+from ..rows import LUMINANCE
 from . import replay
 
 __all__ = ["COLUMNS", "columns", "define"]

@@ -19,6 +19,10 @@ Learned light of exactly k bounces (:monosp:`pssflow`)
    - In place of ``k``: all light up to this depth, counted as in ``path``: 1 is emission alone, 2 has direct light, 3
      light of two bounces. Each length has a guide and a share of the budget of its own; ``spp`` is what each would get
      if all got the same. -1 is refused. (Default: none)
+ * - rr_depth
+   - |int|
+   - With ``max_depth``, bounces from which on long paths are left to chance: their samples halve with each bounce, and
+     may be less than one to a pixel. (Default: none, every length has one or more)
  * - aovs
    - |bool|
    - With ``max_depth``, whether the image has further channels: the light of each length (``k0.R`` …), the variance
@@ -43,6 +47,12 @@ Learned light of exactly k bounces (:monosp:`pssflow`)
  * - emitter_strategy
    - |string|
    - ``mis``, ``nee`` or ``auto``. (Default: ``mis``)
+ * - target
+   - |string|
+   - ``radiance`` or ``gradient``: what the guides of ``dr.backward`` and ``dr.forward`` learn from. With ``gradient``
+     an eighth of ``spp_grad`` is a pilot, of whose paths the derivative is taken one by one; the image's own guides
+     learn from radiance all the same. It pays where the parameters touch a part of the light alone.
+     (Default: ``radiance``)
  * - uniform_fraction
    - |float|
    - Share of uniform paths in the mixture, in [0, 1]. (Default: the guide's, 0.25 for flows; bounds weights by 1/0.25)
@@ -116,7 +126,8 @@ import numpy as np
 from .. import gradients
 from .. import guide as guides
 from ..export.walk import is_scalar
-from ..light import check_depth, render_light
+from ..gradient_guides import Target, check_target
+from ..light import check_depth, check_roulette, render_light
 from ..options import DEFAULT_SPP, Plan
 from ..render import Result, run
 from ..scene import Scene
@@ -163,7 +174,12 @@ def define() -> Callable[[Any], Any]:
             self.max_depth: int | None = props.get("max_depth") if "max_depth" in props else None
             if self.max_depth is not None and "k" in given:
                 raise ValueError("`k` and `max_depth` were both given; give one")
+            rr_depth: Any = props.get("rr_depth") if "rr_depth" in props else None
+            self.rr_depth = check_roulette(rr_depth, self.max_depth)
             self.aovs = bool(props.get("aovs", False)) and self.max_depth is not None
+            self.target = check_target(props.get("target", "radiance"), self.choice)
+            if self.target == "gradient" and is_scalar():
+                raise ValueError(f"`target` = 'gradient': {NO_GRADIENTS}")
             self.progress = bool(props.get("progress", False))
             self.approximate = bool(props.get("approximate", False))
             self.result: Result | None = None
@@ -196,7 +212,10 @@ def define() -> Callable[[Any], Any]:
             if self.max_depth is None:
                 self.result = run(ours, self.choice, plan, self.progress)
             else:
-                self.result = render_light(ours, self.choice, plan, self.max_depth, self.progress)
+                self.result = render_light(
+                    *(ours, self.choice, plan, self.max_depth, self.progress),
+                    rr_depth=self.rr_depth,
+                )
             self.rendered = ours.hash
             _fill(camera.film(), self.result, self.aov_names())
             return camera.film().develop() if develop else mi.TensorXf()
@@ -207,7 +226,9 @@ def define() -> Callable[[Any], Any]:
             """The image's derivative along the parameters' gradients; see `pssflow.gradients`."""
             camera, drawn = self._to_differentiate(scene, params, sensor, spp)
             with dr.suspend_grad():
-                return gradients.forward(*drawn[:2], camera, _scalar(seed), *drawn[2:])
+                return gradients.forward(
+                    *drawn[:2], camera, _scalar(seed), *drawn[2:], self._learner(params)
+                )
 
         def render_backward(
             self,
@@ -221,7 +242,9 @@ def define() -> Callable[[Any], Any]:
             """Adds the gradients of the parameters to what they have; see `pssflow.gradients`."""
             camera, drawn = self._to_differentiate(scene, params, sensor, spp)
             with dr.suspend_grad():
-                gradients.backward(*drawn[:2], camera, grad_in, _scalar(seed), *drawn[2:])
+                gradients.backward(
+                    *drawn[:2], camera, grad_in, _scalar(seed), *drawn[2:], self._learner(params)
+                )
 
         def _to_differentiate(
             self, scene: Any, params: Any, sensor: Any, spp: int
@@ -243,6 +266,12 @@ def define() -> Callable[[Any], Any]:
             samples = int(spp) or self.arguments.get("spp") or camera.sampler().sample_count()
             return camera, (ours, self.result, samples, self.result.stats["parametrisation"])
 
+        def _learner(self, params: Any) -> Target | None:
+            """What asks for guides of the gradient, if that is the target."""
+            if self.target != "gradient":
+                return None
+            return Target(self.choice, params, self.arguments.get("uniform_fraction"))
+
         def aov_names(self) -> list[str]:
             """With `max_depth` and `aovs` a name for each channel of `result`'s layers; else none."""
             if not self.aovs or self.max_depth is None:
@@ -253,6 +282,7 @@ def define() -> Callable[[Any], Any]:
         def to_string(self) -> str:
             """As Mitsuba prints its own."""
             values = {"guide": self.choice.label, "max_depth": self.max_depth}
+            values |= {"rr_depth": self.rr_depth, "target": self.target}
             values |= {**self.arguments, **self.choice.options}
             lines = [f"  {name} = {value}" for name, value in values.items() if value is not None]
             return "PssflowIntegrator[\n" + ",\n".join(lines) + "\n]"

@@ -15,7 +15,7 @@ from ..metrics import Estimate
 from ..report import scene_title
 from .drawing import COLOURS, LINES, MARKERS, MUTED, finish, new_figure, plain_ticks
 from .store import ALL, Row
-from .summary import BASELINE, Cell, Overall
+from .summary import Cell, Overall, named_baseline
 
 __all__ = ["error_chart", "ratio_chart", "style"]
 
@@ -101,7 +101,7 @@ def ratio_chart(
     known: Sequence[str] | None = None,
     caption: str = "",
 ) -> list[Path]:
-    """Ratios to random sampling at equal time by scene, and their geometric mean; bars of two standard errors.
+    """Ratios to the baseline at equal time by scene, and their geometric mean; bars of two standard errors.
 
     Colours are those of the methods in `known`, as in the study's other charts.
 
@@ -112,7 +112,8 @@ def ratio_chart(
     unit = found[0].unit
     times = sorted({cell.time for cell in found})
     scenes = list(dict.fromkeys(cell.scene for cell in found))
-    others = [method for method in methods if method != BASELINE]
+    baseline = found[0].baseline
+    others = [method for method in methods if method != baseline]
     known = known or methods
     labels = [*(scene_title(scene) for scene in scenes), "geometric mean"]
     height = 0.16 * max(len(others), 2) + 0.1
@@ -158,7 +159,7 @@ def ratio_chart(
         axes.set_title(f"{time:g} {unit}", fontsize=10)
         equal = "equal time" if unit == "s" else "equal samples"
         axes.set_xlabel(
-            f"relMSE of random sampling ÷ of the method\n({equal}; right of 1 is a gain)",
+            f"relMSE of {named_baseline(baseline)} ÷ of the method\n({equal}; right of 1 is a gain)",
             fontsize=8.5,
         )
         axes.grid(axis="x", which="both", color="#dddddd", linewidth=0.5)

@@ -170,8 +170,11 @@ def conduct(
     threads: int | None,
     reference_time: float,
     output: str,
+    heading: str | None = None,
 ) -> None:
     """Runs what is not there yet; publishes scene after scene, and prints what `publish` returns in the end.
+
+    `heading` says what is shown; None for light of k bounces.
 
     Raises:
         RuntimeError: there is nothing to show; the message says why.
@@ -195,15 +198,15 @@ def conduct(
         progress=not terminal.quiet,
         unit=unit,
     )
-    heading = title(times, k, unit)
-    study.publish = lambda rows: publish(study, rows, heading)
+    shown = heading or title(times, k, unit)
+    study.publish = lambda rows: publish(study, rows, shown)
     rows = study.run()
     if not rows:
         raise RuntimeError(
             "there is nothing to show: no scene could be rendered"
             + "".join(f"; {what}: {why}" for what, why in study.failures.items())
         )
-    for part in publish(study, rows, heading):
+    for part in publish(study, rows, shown):
         terminal.out.print(part, highlight=False, soft_wrap=isinstance(part, str))
 
 

@@ -147,7 +147,7 @@ class Study:
 
     def __post_init__(self) -> None:
         make_folder(self.folder / "images")
-        self.store = Store(self.folder / "results.csv")
+        self.store = Store(self.folder / "results.csv", Row)
         self.failures: dict[str, str] = {}
         """Scenes, and methods on scenes, that could not be shown, and why."""
         self._digests: dict[str, str] = {}

@@ -36,12 +36,14 @@ from .harness import Method, Shot
 from .store import ALL, BOUNCES
 
 __all__ = [
+    "MITSUBA",
     "OTHERS",
     "PATH",
     "Stage",
     "guided",
     "method_names",
     "missing",
+    "mitsuba",
     "named_method",
     "shot_of",
 ]
@@ -115,8 +117,25 @@ def missing(name: str) -> str | None:
 
 def named_method(name: str, k: int, threads: int | None, unit: str = "s") -> Method:
     """The method of that name; its budgets are seconds, or with the unit `spp` samples per pixel."""
-    if name in MITSUBA or name == PATH:
-        return _mitsuba(name, MITSUBA.get(name, "llvm_ad_rgb"), k, threads, unit)
+    if name == PATH:
+        return mitsuba(
+            name,
+            "llvm_ad_rgb",
+            lambda stage, scene: AllLightPass(scene, 0, hide=stage.scene.hide_emitters),
+            threads,
+            unit,
+            {"integrator": "path"},
+            light=ALL,
+        )
+    if name in MITSUBA:
+
+        def k_bounces(stage: Stage, scene: Any) -> Pass:
+            if stage.scene.hide_emitters:
+                raise ValueError("`hide_emitters` is set, which pssflow_kbounce does not know")
+            return KBouncePass(scene, 0, k)
+
+        options = {"integrator": "pssflow_kbounce"}
+        return mitsuba(name, MITSUBA[name], k_bounces, threads, unit, options)
     if name == VEGAS:
         from importlib.metadata import version
 
@@ -185,22 +204,34 @@ def shot_of(result: Result, budget: float) -> Shot:
     )
 
 
-def _mitsuba(name: str, variant: str, k: int, threads: int | None, unit: str) -> Method:
-    """Mitsuba's path tracer, for k-bounce light or for all, in passes until the time or the samples are over."""
+def mitsuba(
+    name: str,
+    variant: str,
+    make: Callable[[Stage, Any], Pass],
+    threads: int | None,
+    unit: str,
+    options: Mapping[str, Any],
+    light: str = BOUNCES,
+) -> Method:
+    """An integrator of Mitsuba's, in passes until the time or the samples are over.
+
+    Args:
+        name: as the charts have it.
+        variant: of Mitsuba.
+        make: gives a pass of the stage's scene as it is in that variant.
+        threads: None for all cores.
+        unit: `s` or `spp`.
+        options: for the record.
+        light: what it renders.
+    """
 
     def run(stage: Stage, seed: int, times: Sequence[float], progress: Progress) -> list[Shot]:
         if name in stage.too_slow:
             return []
-        if stage.scene.hide_emitters and name != PATH:
-            raise ValueError("`hide_emitters` is set, which pssflow_kbounce does not know")
         before = stage.scene.variant
         try:
             scene = stage.in_variant(variant)
-            one: Pass = (
-                AllLightPass(scene, 0, hide=stage.scene.hide_emitters)
-                if name == PATH
-                else KBouncePass(scene, 0, k)
-            )
+            one = make(stage, scene)
             try:
                 with _threads(threads), reporting(progress) as listener:
                     passes = _counted if unit == "spp" else _passes
@@ -216,13 +247,12 @@ def _mitsuba(name: str, variant: str, k: int, threads: int | None, unit: str) ->
         return shots
 
     budget = "rendering inside; loading and compiling outside"
-    options = {"integrator": "path" if name == PATH else "pssflow_kbounce", "variant": variant}
     return Method(
         name,
         run,
-        options,
+        {**options, "variant": variant},
         budget="all samples of the render; compiling outside" if unit == "spp" else budget,
-        light=ALL if name == PATH else BOUNCES,
+        light=light,
     )
 
 

@@ -12,7 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..guide import LUMINANCE, Guide
+from ..guide import Guide
+from ..rows import LUMINANCE
 from ..scene import Pilot, Scene
 
 __all__ = ["Densities", "HeldOut"]

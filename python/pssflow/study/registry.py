@@ -29,6 +29,14 @@ STUDIES = {
         "capacity",
         "Error and predicted gain against the size of the model at equal time: how small is enough.",
     ),
+    "gradients": (
+        "gradients",
+        "Variance of gradients against uniform numbers at equal time, parameter by parameter.",
+    ),
+    "light": (
+        "light",
+        "Whole images against Mitsuba's path at the same depth: error × time, wins and losses.",
+    ),
     "results": (
         "results",
         "docs/results.md from a finished study: wins and losses of every method, and how it was measured.",

@@ -21,7 +21,18 @@ from .harness import Study
 from .methods import OTHERS
 from .page import Chart, study_scenes, write_page
 from .store import ALL, Row
-from .summary import BASELINE, CLOSE, Cell, Choice, Overall, cells, choices, overall, reaches
+from .summary import (
+    BASELINE,
+    CLOSE,
+    Cell,
+    Choice,
+    Overall,
+    cells,
+    choices,
+    named_baseline,
+    overall,
+    reaches,
+)
 
 __all__ = [
     "NOTES",
@@ -82,8 +93,12 @@ class Sheet:
     """Whether a page begins with it."""
 
 
-def publish(study: Study, rows: Sequence[Row], title: str) -> list[Any]:
+def publish(
+    study: Study, rows: Sequence[Row], title: str, *, baseline: str = BASELINE, notes: str = NOTES
+) -> list[Any]:
     """Writes summary.md, charts as PNG and SVG, and report.html; returns what the command prints.
+
+    Ratios are those of `baseline` ÷ the method; `notes` say how to read the tables.
 
     Raises:
         OSError: a file cannot be written.
@@ -94,11 +109,11 @@ def publish(study: Study, rows: Sequence[Row], title: str) -> list[Any]:
     early = [row for row in rows if not row.spp]
     rows = [row for row in rows if row.spp]
     methods = [m.name for m in study.methods if any(row.method == m.name for row in rows)]
-    found = cells(rows)
+    found = cells(rows, baseline)
     total = overall(found)
     picked = choices(found, competitors=OTHERS) if "auto" in methods else []
     sheets = [
-        *([sums_sheet(total, study.unit)] if total else []),
+        *([sums_sheet(total, study.unit, baseline)] if total else []),
         errors_sheet(found),
         *([_ratios(found)] if total else []),
         *([sheet] if (sheet := _times_toerrors_sheet(found, study.unit)).rows else []),
@@ -114,7 +129,7 @@ def publish(study: Study, rows: Sequence[Row], title: str) -> list[Any]:
         *machine_lines([vars(row) for row in rows or early], any_row.processor, any_row.mitsuba),
     ]
     heading = title[0].upper() + title[1:]
-    write_summary(study.folder / "summary.md", heading, sheets, [NOTES, *lines])
+    write_summary(study.folder / "summary.md", heading, sheets, [notes, *lines])
     charts = _charts(study, rows, methods, found, total, title) if rows else []
     write_page(
         study.folder,
@@ -123,12 +138,12 @@ def publish(study: Study, rows: Sequence[Row], title: str) -> list[Any]:
         charts=charts,
         scenes=study_scenes(study, rows),
         lines=lines,
-        notes=NOTES,
+        notes=notes,
         unit=study.unit,
     )
     shown: list[Any] = [rich_table(sheet) for sheet in [*sheets[1:], *sheets[:1]]]
     written = f"wrote {study.folder}: report.html, results.csv, summary.md, charts, images"
-    return [*shown, NOTES, *lines, written]
+    return [*shown, notes, *lines, written]
 
 
 def write_summary(path: Path, heading: str, sheets: Sequence[Sheet], lines: Sequence[str]) -> None:
@@ -187,9 +202,9 @@ def _ratios(found: Sequence[Cell]) -> Sheet:
             cell.verdict,
         ]
         for cell in found
-        if cell.method != BASELINE and cell.gained is not None
+        if cell.method != cell.baseline and cell.gained is not None
     ]
-    return Sheet("Ratios to random sampling", headings, table)
+    return Sheet(f"Ratios to {named_baseline(found[0].baseline)}", headings, table)
 
 
 def _times_toerrors_sheet(found: Sequence[Cell], unit: str) -> Sheet:
@@ -215,7 +230,7 @@ def _times_toerrors_sheet(found: Sequence[Cell], unit: str) -> Sheet:
     return Sheet(what, ("scene", "relMSE", *methods), table, texts=1)
 
 
-def sums_sheet(total: Sequence[Overall], unit: str) -> Sheet:
+def sums_sheet(total: Sequence[Overall], unit: str, baseline: str = BASELINE) -> Sheet:
     """A line for each method and budget, over all scenes."""
     equal = "equal time" if unit == "s" else "equal samples"
     headings = (
@@ -234,7 +249,8 @@ def sums_sheet(total: Sequence[Overall], unit: str) -> Sheet:
         ]
         for o in total
     ]
-    return Sheet("Summary: random sampling ÷ the method", headings, table, summary=True)
+    what = f"Summary: {named_baseline(baseline)} ÷ the method"
+    return Sheet(what, headings, table, summary=True)
 
 
 def _charts(
@@ -275,9 +291,9 @@ def _charts(
         charts.append(Chart(path.with_suffix(".svg"), heading))
     known = methods
     methods = [method for method in methods if any(row.method == method for row in rows)]
-    if any(method != BASELINE for method in methods) and any(c.gained for c in found):
+    if len(methods) > 1 and any(c.gained for c in found):
         path = study.folder / "ratio.png"
-        heading = f"Gain over random sampling: {title}"
+        heading = f"Gain over {named_baseline(found[0].baseline)}: {title}"
         bars = f"Bars: two standard errors over {seeds}. {rows[0].processor}."
         ratio_chart(path, heading, found, total, methods, known=known, caption=bars)
         charts.insert(1, Chart(path.with_suffix(".svg"), heading, first=True))

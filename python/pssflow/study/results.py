@@ -35,7 +35,7 @@ def results(terminal: Terminal, folder: str, output: str) -> None:
     target = Path(output)
     table = target.with_suffix(".csv")
     check_writable(target)
-    rows, left_out = _newest(Store(source).rows)
+    rows, left_out = _newest(Store(source, Row).rows)
     if not rows:
         raise ValueError(f"{source}: holds no run")
     text = document(rows, Path(folder), table.name)

@@ -64,12 +64,14 @@ def scenery(
     progress: Progress = False,
     note: Callable[[str], object] = lambda text: None,
     light: str = BOUNCES,
+    max_depth: int = -1,
 ) -> Scenery:
     """A scene whose film has about so many pixels; its truth is Mitsuba's, cached under the scene's hash.
 
-    With `light` = `all` it is a scene of another name, whose truth is the whole image.
+    With `light` = `all` it is a scene of another name, whose truth is the whole image. With another one than that and
+    `k bounces` the truth is the whole image of paths up to `max_depth`, which all methods are expected to render.
     """
-    name = plan.name if light == BOUNCES else f"{plan.name}, all light"
+    name = f"{plan.name}, all light" if light == ALL else plan.name
 
     def open_it() -> Case:
         import mitsuba as mi
@@ -94,7 +96,12 @@ def scenery(
 
         def truth() -> Reference:
             found = reference(
-                scene, k, seconds=reference_time, progress=progress, all_light=light == ALL
+                scene,
+                k,
+                seconds=reference_time,
+                progress=progress,
+                all_light=light != BOUNCES,
+                max_depth=max_depth,
             )
             note(f"{name}: reference: {found.note}")
             return found

@@ -1,4 +1,4 @@
-"""results.csv: a row for each image that a study measured.
+"""results.csv: a row for each image, or other thing, that a study measured.
 
 A run (one method, one scene, one seed) yields as many rows as it had times. The file is rewritten whole and renamed, so
 that it never holds half a run, whatever interrupts the study.
@@ -13,14 +13,25 @@ import json
 import os
 import platform
 import subprocess
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 from ..files import first_line, write_beside
 
-__all__ = ["ALL", "BOUNCES", "Row", "Store", "commit", "configuration", "processor", "write_rows"]
+__all__ = [
+    "ALL",
+    "BOUNCES",
+    "Row",
+    "Store",
+    "Stored",
+    "commit",
+    "configuration",
+    "parse",
+    "processor",
+    "write_rows",
+]
 
 BOUNCES, ALL = "k bounces", "all"
 """What a truth, and a method, holds: light of exactly k bounces, or all light. The two are never compared."""
@@ -108,44 +119,63 @@ class Row:
         """Scene, method, seed."""
         return self.scene, self.method, self.seed
 
-    @classmethod
-    def parse(cls, texts: Mapping[str, str]) -> Row:
-        """A row as the file has it.
 
-        Raises:
-            ValueError: a column is missing or holds no number.
-        """
-        values: dict[str, Any] = {}
-        for item in dataclasses.fields(cls):
-            text = texts.get(item.name)
-            if text is None:
-                raise ValueError(f"column `{item.name}` is missing")
-            kind = str(item.type)
-            if text == "" and "None" in kind:
-                values[item.name] = None
-            elif kind.startswith("int"):
-                values[item.name] = int(text)
-            elif kind.startswith("float"):
-                values[item.name] = float(text)
-            else:
-                values[item.name] = text
-        return cls(**values)
+T = TypeVar("T", bound="Stored")
 
 
-class Store:
+class Stored(Protocol):
+    """A row of a table: a dataclass of texts and numbers, each of which may be None if its type says so."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    @property
+    def run(self) -> tuple[str, str, int]:
+        """What it is a result of; a run's rows are kept or replaced together."""
+        ...
+
+    @property
+    def configuration(self) -> str:
+        """Hash of all that decides it."""
+        ...
+
+
+def parse(kind: type[T], texts: Mapping[str, str]) -> T:
+    """A row as the file has it.
+
+    Raises:
+        ValueError: a column is missing or holds no number.
+    """
+    values: dict[str, Any] = {}
+    for item in dataclasses.fields(kind):
+        text = texts.get(item.name)
+        if text is None:
+            raise ValueError(f"column `{item.name}` is missing")
+        declared = str(item.type)
+        if text == "" and "None" in declared:
+            values[item.name] = None
+        elif declared.startswith("int"):
+            values[item.name] = int(text)
+        elif declared.startswith("float"):
+            values[item.name] = float(text)
+        else:
+            values[item.name] = text
+    return kind(**values)
+
+
+class Store(Generic[T]):
     """The rows of one file.
 
     Raises:
         ValueError: the file is there, but is none of ours.
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: str | Path, kind: type[T]) -> None:
         self.path = Path(path)
-        self.rows: list[Row] = []
+        self.rows: list[T] = []
         if self.path.exists():
             try:
                 with self.path.open(newline="", encoding="utf-8") as file:
-                    self.rows = [Row.parse(texts) for texts in csv.DictReader(file)]
+                    self.rows = [parse(kind, texts) for texts in csv.DictReader(file)]
             except (OSError, ValueError, csv.Error) as error:
                 raise ValueError(
                     f"{self.path}: is no table of this version of pssflow ({first_line(error)}); "
@@ -156,7 +186,7 @@ class Store:
         """Whether a finished run of this configuration is there."""
         return any(row.configuration == configuration for row in self.rows)
 
-    def put(self, rows: Iterable[Row]) -> None:
+    def put(self, rows: Iterable[T]) -> None:
         """Writes the rows of one run, in place of those of the same scene, method and seed.
 
         Raises:
@@ -168,8 +198,8 @@ class Store:
         write_rows(self.path, self.rows)
 
 
-def write_rows(path: Path, rows: Iterable[Row]) -> None:
-    """Rows as a CSV that `Store` reads.
+def write_rows(path: Path, rows: Sequence[Stored]) -> None:
+    """Rows of one kind, at least one, as a CSV that `Store` reads.
 
     Raises:
         OSError: the file cannot be written.
@@ -177,7 +207,7 @@ def write_rows(path: Path, rows: Iterable[Row]) -> None:
 
     def write(part: Path) -> None:
         with part.open("w", newline="", encoding="utf-8") as file:
-            names = [item.name for item in dataclasses.fields(Row)]
+            names = [item.name for item in dataclasses.fields(rows[0])]
             writer = csv.DictWriter(file, names, lineterminator="\n")
             writer.writeheader()
             writer.writerows(dataclasses.asdict(row) for row in rows)

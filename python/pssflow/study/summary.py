@@ -24,6 +24,7 @@ __all__ = [
     "Reach",
     "cells",
     "choices",
+    "named_baseline",
     "overall",
     "reaches",
     "targets",
@@ -38,6 +39,11 @@ CLOSE = 1.15
 
 SIGNIFICANT = 2.0
 """Standard errors."""
+
+
+def named_baseline(method: str) -> str:
+    """A baseline in words."""
+    return "random sampling" if method == BASELINE else method
 
 
 @dataclass(frozen=True)
@@ -72,6 +78,8 @@ class Cell:
     """Seconds a path, pilot and training inside, in the baseline's: below 1 is cheaper."""
     equal_samples: Estimate | None
     equal_time: Estimate | None
+    baseline: str = BASELINE
+    """The method that ratios are formed with."""
 
     @property
     def gained(self) -> Estimate | None:
@@ -81,7 +89,7 @@ class Cell:
     @property
     def verdict(self) -> str:
         """`win` or `loss` beyond two standard errors, `tie`, or nothing where there is nothing to compare."""
-        if self.method == BASELINE or self.gained is None:
+        if self.method == self.baseline or self.gained is None:
             return ""
         ratio, error = self.gained
         if not math.isfinite(error):
@@ -96,7 +104,7 @@ class Cell:
         return self.relmse.value < self.reference_variance
 
 
-def cells(rows: Iterable[Row]) -> list[Cell]:
+def cells(rows: Iterable[Row], baseline: str = BASELINE) -> list[Cell]:
     """All cells, in the order of the rows; rows of times at which there was no image are left out."""
     groups: dict[tuple[str, str, float], list[Row]] = {}
     for row in rows:
@@ -105,12 +113,10 @@ def cells(rows: Iterable[Row]) -> list[Cell]:
         groups.setdefault((row.scene, row.method, row.time), []).append(row)
     found = []
     for (scene, method, time), group in groups.items():
-        base = groups.get((scene, BASELINE, time))
+        base = groups.get((scene, baseline, time))
 
-        def over(baseline: list[float] | None, own: list[float]) -> Estimate | None:
-            return (
-                None if baseline is None else ratio(mean_and_error(baseline), mean_and_error(own))
-            )
+        def over(theirs: list[float] | None, own: list[float]) -> Estimate | None:
+            return None if theirs is None else ratio(mean_and_error(theirs), mean_and_error(own))
 
         variances = [row.own_variance for row in group]
         known = [v for v in variances if v is not None]
@@ -162,6 +168,7 @@ def cells(rows: Iterable[Row]) -> list[Cell]:
                     [r.relmse * r.elapsed for r in base] if base else None,
                     [row.relmse * row.elapsed for row in group],
                 ),
+                baseline=baseline,
             )
         )
     return found
@@ -209,9 +216,9 @@ def overall(found: Sequence[Cell]) -> list[Overall]:
     """All methods but the baseline, in the order of the cells."""
     groups: dict[tuple[str, float], list[tuple[Cell, Estimate]]] = {}
     drowned: dict[tuple[str, float], list[str]] = {}
-    based = {(cell.scene, cell.time) for cell in found if cell.method == BASELINE}
+    based = {(cell.scene, cell.time) for cell in found if cell.method == cell.baseline}
     for cell in found:
-        if cell.method == BASELINE:
+        if cell.method == cell.baseline:
             continue
         if cell.gained is None:
             if (cell.scene, cell.time) in based:
@@ -348,7 +355,7 @@ def targets(found: Sequence[Cell], scene: str) -> list[float]:
     Rounded up to two digits, so that they can be read, and left out below the reference's noise.
     """
     own = [cell for cell in found if cell.scene == scene]
-    base = [cell for cell in own if cell.method == BASELINE]
+    base = [cell for cell in own if cell.method == cell.baseline]
     base = base or [cell for cell in own if cell.method == own[0].method]
     errors = [cell.relmse.value for cell in base if cell.relmse.value > cell.reference_variance]
     return sorted({_rounded_up(error) for error in errors if error > 0.0}, reverse=True)

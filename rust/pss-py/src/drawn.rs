@@ -49,3 +49,23 @@ pub(crate) fn to_dict<'py>(
     dict.set_item("mis", arrays::to_vector::<f32>(py, mis))?;
     Ok(dict)
 }
+
+/// What guides learn from beside that: all numbers, and the density of all of them together.
+pub(crate) fn set_numbers(
+    py: Python<'_>,
+    dict: &Bound<'_, PyDict>,
+    blocks: &[Paths],
+    mixture: Mixture,
+    width: usize,
+) -> PyResult<()> {
+    let u = blocks.iter().flat_map(|b| b.u.iter().copied()).collect();
+    dict.set_item("u", arrays::to_matrix(py, u, width)?)?;
+    let both =
+        |b: &Paths| -> Vec<f32> { b.q_nee.iter().zip(&b.q_ray).map(|(a, b)| a * b).collect() };
+    let m = blocks
+        .iter()
+        .flat_map(both)
+        .map(|q| mixture.density(q))
+        .collect();
+    dict.set_item("m_both", arrays::to_vector::<f32>(py, m))
+}

@@ -3,15 +3,17 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use numpy::{PyReadonlyArray1, PyReadonlyArray2};
-use pss_guide::{Context, Decision, Header, Recipe, Records};
+use numpy::PyReadonlyArray2;
+use pss_guide::{Context, Decision, Header, Recipe};
 use pss_rng::{Purpose, Stream};
+use pssflow::{Auto, GuideChoice, Named, Phase, Progress};
 use pyo3::exceptions::PyMemoryError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use serde_json::{Map, Value};
 
-use crate::watch::watched;
+use crate::rows::Rows;
+use crate::watch::{Shared, watched};
 use crate::{arrays, contexts, errors};
 
 /// A fitted density on the cube of primary numbers.
@@ -26,75 +28,60 @@ const CHUNK: usize = 1 << 14;
 
 #[pymethods]
 impl Guide {
-    /// Fits guide `name` to numbers and contributions, and for a guide that looks at vertices to these.
+    /// Fits guide `name` to paths; see the stub.
     #[staticmethod]
-    #[pyo3(signature = (
-        name, u, f, *, f_max=None, f_bsdf=None, ray=None, g=None, zeros=0, contexts=None, pixel=None, emitters=Vec::new(),
-        options="{}", seed=0, progress=None
-    ))]
-    #[allow(clippy::too_many_arguments)]
+    #[pyo3(signature = (name, records, *, options="{}", seed=0, progress=None))]
     fn fit(
         py: Python<'_>,
         name: &str,
-        u: PyReadonlyArray2<'_, f32>,
-        f: PyReadonlyArray1<'_, f32>,
-        f_max: Option<PyReadonlyArray1<'_, f32>>,
-        f_bsdf: Option<PyReadonlyArray1<'_, f32>>,
-        ray: Option<PyReadonlyArray2<'_, f32>>,
-        g: Option<PyReadonlyArray1<'_, f32>>,
-        zeros: u64,
-        contexts: Option<Bound<'_, PyDict>>,
-        pixel: Option<PyReadonlyArray2<'_, f32>>,
-        emitters: Vec<(f32, bool)>,
+        records: &Bound<'_, PyDict>,
         options: &str,
         seed: u64,
         progress: Option<Py<PyAny>>,
     ) -> PyResult<Self> {
         let options = parse_options(options)?;
         let recipe = Recipe::parse(name, &options).map_err(errors::guide)?;
-        let (u, dims) = arrays::matrix(&u);
-        let f = arrays::vector(&f);
-        let f_max = f_max.map_or_else(|| f.clone(), |a| arrays::vector(&a));
-        let f_bsdf = f_bsdf.map_or_else(Vec::new, |a| arrays::vector(&a));
-        let ray = ray.map_or(Ok(Vec::new()), |a| arrays::rows::<2>(&a, "ray"))?;
-        let g = g.map_or_else(|| vec![1.0; f.len()], |a| arrays::vector(&a));
-        let pixel = pixel.map_or(Ok(Vec::new()), |a| arrays::rows::<2>(&a, "pixel"))?;
-        let vertices = f.len() * (dims.saturating_sub(1) / 2);
-        let contexts = match contexts {
-            Some(dict) => contexts::contexts(&dict, vertices)?,
-            None if recipe.looks_at_contexts() => {
-                return Err(errors::value(format!(
-                    "guide {name:?} looks at where paths are: give `contexts`, as `Pilot.fit` does"
-                )));
-            }
-            None => Vec::new(),
-        };
-        let emitters = contexts::emitters(emitters);
+        let rows = Rows::of(records)?;
+        if !rows.has_contexts() && recipe.looks_at_contexts() {
+            return Err(errors::value(format!(
+                "guide {name:?} looks at where paths are: give `contexts`, as `Pilot.fit` does"
+            )));
+        }
         let fit = watched(py, progress.as_ref(), |shared| {
-            let records = Records {
-                dims,
-                u: &u,
-                f: &f,
-                f_bsdf: &f_bsdf,
-                f_max: &f_max,
-                ray: &ray,
-                g: &g,
-                contexts: &contexts,
-                pixel: &pixel,
-                emitters: &emitters,
-                zeros,
-                ..Records::default()
-            };
-            use pssflow::Progress;
-            recipe.fit(&records, seed, &mut |done| {
-                shared.update(pssflow::Phase::Fit, done);
-                !shared.cancelled()
-            })
+            recipe.fit(&rows.view(), seed, &mut reporting(shared))
         })?
         .map_err(errors::guide)?;
         Ok(Self {
             inner: Arc::from(fit.guide),
         })
+    }
+
+    /// Learns as a render does, `auto` included; see the stub.
+    #[staticmethod]
+    #[pyo3(signature = (name, records, *, paths, found, options="{}", seed=0))]
+    fn learn(
+        py: Python<'_>,
+        name: &str,
+        records: &Bound<'_, PyDict>,
+        paths: f64,
+        found: f64,
+        options: &str,
+        seed: u64,
+    ) -> PyResult<Option<(Self, f32)>> {
+        let choice = choice(name, &parse_options(options)?)?;
+        let rows = Rows::of(records)?;
+        let left = pssflow::Left {
+            paths,
+            seconds_per_path: None,
+            threads: 0,
+            found,
+        };
+        let learned = watched(py, None, |shared| {
+            choice.learn(&rows.view(), &left, seed, &mut reporting(shared))
+        })?
+        .map_err(errors::guide)?;
+        let guide = |(guide, a)| (Self { inner: guide }, a);
+        Ok(learned.map(guide))
     }
 
     /// Reads a guide; with both hashes it is refused for another scene or other columns.
@@ -302,6 +289,24 @@ impl Guide {
             None => Ok(Vec::new()),
         }
     }
+}
+
+/// A watcher as trainings report to it.
+fn reporting(shared: &Shared) -> impl FnMut(f32) -> bool + '_ {
+    |done| {
+        shared.update(Phase::Fit, done);
+        !shared.cancelled()
+    }
+}
+
+/// A guide to learn, or `auto`, by its name.
+pub(crate) fn choice(name: &str, options: &Map<String, Value>) -> PyResult<GuideChoice> {
+    if name == "auto" {
+        let auto = Auto::new().map_err(errors::guide)?;
+        return Ok(GuideChoice::Auto(Arc::new(auto)));
+    }
+    let recipe = Recipe::parse(name, options).map_err(errors::guide)?;
+    Ok(GuideChoice::Learn(Arc::new(Named::new(recipe))))
 }
 
 /// JSON options of a guide.

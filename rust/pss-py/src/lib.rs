@@ -11,6 +11,7 @@ mod guide;
 mod outcome;
 mod output;
 mod parity;
+mod rows;
 mod scene;
 mod watch;
 

@@ -57,6 +57,7 @@ fn record(outcome: &Outcome, options: &Options) -> Value {
         "parametrisation": options.parametrisation.name(),
         "emitter_strategy": options.strategy.name(),
         "seed": options.seed,
+        "survival": options.survival,
         "threads": outcome.threads,
         "nonzero_share": outcome.rendered.counts.nonzero_share(),
         "pilot": pilot,

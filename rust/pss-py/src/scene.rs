@@ -7,14 +7,14 @@ use std::sync::{Arc, OnceLock};
 use numpy::PyReadonlyArray2;
 use pss_render::math::Rgb;
 use pss_render::{Columns, EmitterStrategy, Parametrisation, Paths, Tracer};
-use pssflow::{Auto, Budget, Combine, GuideChoice, Mixture, Named, Options, PassPlan};
+use pssflow::{Budget, Combine, GuideChoice, Mixture, Options, PassPlan};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use serde::Deserialize;
 use serde_json::{Map, Value, json};
 
 use crate::foreign::{ForeignGuide, Guarded};
-use crate::guide::Guide;
+use crate::guide::{self, Guide};
 use crate::watch::watched;
 use crate::{arrays, drawn, errors, outcome};
 
@@ -51,6 +51,8 @@ struct Request {
     #[serde(default)]
     snapshots: Vec<f64>,
     replay: Option<Vec<PassPlan>>,
+    #[serde(default = "always")]
+    survival: f32,
     uniform_fraction: Option<f32>,
     pilot_spp: Option<u32>,
     keep_pilot: bool,
@@ -58,6 +60,10 @@ struct Request {
     combine: Combine,
     seed: u64,
     threads: usize,
+}
+
+fn always() -> f32 {
+    1.0
 }
 
 pub(crate) fn parametrisation(name: &str) -> PyResult<Parametrisation> {
@@ -272,13 +278,14 @@ impl Scene {
     }
 
     /// What a probe sees of path lengths, each (k, strategy), and the samples per pixel that each gets of `spp`, JSON.
-    #[pyo3(signature = (lengths, *, spp, parametrisation, threads=0))]
+    #[pyo3(signature = (lengths, *, spp, parametrisation, rr_depth=None, threads=0))]
     fn lengths(
         &self,
         py: Python<'_>,
         lengths: Vec<(usize, String)>,
         spp: f64,
         parametrisation: &str,
+        rr_depth: Option<usize>,
         threads: usize,
     ) -> PyResult<String> {
         let parametrisation = self::parametrisation(parametrisation)?;
@@ -287,9 +294,11 @@ impl Scene {
             .map(|(k, name)| Ok((k, strategy(&name)?)))
             .collect::<PyResult<Vec<_>>>()?;
         let probed = py
-            .detach(|| pssflow::probe_lengths(&self.inner, &lengths, parametrisation, threads))
+            .detach(|| {
+                pssflow::probe_lengths(&self.inner, &lengths, parametrisation, rr_depth, threads)
+            })
             .map_err(errors::render)?;
-        let shares = pssflow::allot(&probed, spp);
+        let shares = pssflow::allot(&probed, spp, rr_depth);
         let with_share = |(length, spp): (&pssflow::Length, f64)| {
             let mut value = json!(length);
             value["spp"] = json!(spp);
@@ -301,7 +310,8 @@ impl Scene {
 
     /// Draws paths as a pass does and returns what each decision came to, in the order of pixels.
     #[pyo3(signature = (
-        guide=None, *, uniform_fraction, first_sample, spp, k, parametrisation, emitter_strategy, seed=0, threads=0
+        guide=None, *, uniform_fraction, first_sample, spp, k, parametrisation, emitter_strategy, seed=0, threads=0,
+        numbers=false
     ))]
     #[allow(clippy::too_many_arguments)]
     fn draw<'py>(
@@ -316,6 +326,7 @@ impl Scene {
         emitter_strategy: &str,
         seed: u64,
         threads: usize,
+        numbers: bool,
     ) -> PyResult<Bound<'py, PyDict>> {
         let tracer = self.tracer(k, parametrisation, emitter_strategy)?;
         self.check_at_once(spp)?;
@@ -342,7 +353,11 @@ impl Scene {
                 pssflow::drawn_blocks(&tracer, guide, seed, (first_sample, spp), threads)
             })
             .map_err(errors::render)?;
-        drawn::to_dict(py, &blocks, mixture, k)
+        let dict = drawn::to_dict(py, &blocks, mixture, k)?;
+        if numbers {
+            drawn::set_numbers(py, &dict, &blocks, mixture, tracer.columns().width())?;
+        }
+        Ok(dict)
     }
 
     /// Times the Embree queries of a render alone.
@@ -415,10 +430,6 @@ impl Scene {
         };
         match request.guide.as_str() {
             "none" => Ok(GuideChoice::None),
-            "auto" => {
-                let auto = Auto::new().map_err(errors::guide)?;
-                Ok(GuideChoice::Auto(Arc::new(auto)))
-            }
             "ready" => {
                 let guide = given()?.extract::<PyRef<'_, Guide>>()?;
                 Ok(GuideChoice::Ready(Arc::clone(&guide.inner)))
@@ -428,13 +439,8 @@ impl Scene {
                 *foreign = Some(object.clone());
                 Ok(GuideChoice::Learn(Arc::new(object)))
             }
-            name => {
-                // Before minutes of pilot, not after.
-                let recipe = pss_guide::Recipe::parse(name, &request.guide_options);
-                Ok(GuideChoice::Learn(Arc::new(Named::new(
-                    recipe.map_err(errors::guide)?,
-                ))))
-            }
+            // Before minutes of pilot, not after.
+            name => guide::choice(name, &request.guide_options),
         }
     }
 
@@ -455,6 +461,7 @@ impl Scene {
             strategy: strategy(&request.emitter_strategy)?,
             budget,
             snapshots: request.snapshots.clone(),
+            survival: request.survival,
             uniform_fraction: request.uniform_fraction,
             pilot_spp: request.pilot_spp,
             keep_pilot: request.keep_pilot,

@@ -92,6 +92,9 @@ pub trait Chooser: Send + Sync {
     fn recall(&self, name: &str) -> Option<Arc<dyn Learner>>;
 }
 
+/// A guide and the share of uniform paths that suits it.
+pub type Learned = (Arc<dyn Guide>, f32);
+
 /// Where the numbers come from.
 #[derive(Clone)]
 pub enum GuideChoice {
@@ -106,6 +109,41 @@ pub enum GuideChoice {
 }
 
 impl GuideChoice {
+    /// Learns a guide and its share of uniform paths from paths that are at hand. What they weigh need not be radiance:
+    /// of `f` and `f_bsdf` the guide lowers the second moment, whatever these are.
+    ///
+    /// `None` where there is nothing to learn, or too little to learn from.
+    ///
+    /// # Errors
+    /// [`GuideError`] of the fits.
+    pub fn learn(
+        &self,
+        records: &Records<'_>,
+        left: &Left,
+        seed: u64,
+        progress: &mut dyn FnMut(f32) -> bool,
+    ) -> Result<Option<Learned>, GuideError> {
+        let learned = match self {
+            Self::None | Self::Ready(_) => return Ok(None),
+            Self::Learn(learner) => learner
+                .fit(records, seed, progress)
+                .map(|fit| Some((fit, learner.uniform_fraction()))),
+            Self::Auto(chooser) => chooser.choose(records, left, seed, progress).and_then(|c| {
+                let fit = match (c.fit, c.learner) {
+                    (Some(fit), _) => Some(fit),
+                    (None, Some(learner)) => Some(learner.fit(records, seed, progress)?),
+                    (None, None) => None,
+                };
+                Ok(fit.map(|fit| (fit, c.uniform_fraction)))
+            }),
+        };
+        match learned {
+            Ok(learned) => Ok(learned.map(|(fit, a)| (Arc::from(fit.guide), a))),
+            Err(GuideError::TooFewPaths { .. } | GuideError::Diverged { .. }) => Ok(None),
+            Err(e) => Err(e),
+        }
+    }
+
     /// Whether a pilot is needed.
     pub(crate) fn learns(&self) -> bool {
         matches!(self, Self::Learn(_) | Self::Auto(_))

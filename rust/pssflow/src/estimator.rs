@@ -121,6 +121,7 @@ pub fn render(
     let context = PassContext {
         tracer,
         seed: options.seed,
+        survival: options.survival,
         progress,
         pool: &pool,
     };

@@ -30,7 +30,7 @@ mod tail;
 mod trace;
 
 pub use auto::{Auto, Named};
-pub use choice::{Chooser, Chosen, GuideChoice, Learner, Left};
+pub use choice::{Chooser, Chosen, GuideChoice, Learned, Learner, Left};
 pub use diagnostics::{Diagnostics, Means, Measured, SecondMoment};
 pub use error::RenderError;
 pub use estimator::{Outcome, Seconds, render};

@@ -108,6 +108,9 @@ pub struct Options {
     pub budget: Budget,
     /// Shorter times of a [`Budget::Time`], increasing, at which the image so far is handed out.
     pub snapshots: Vec<f64>,
+    /// Probability that a path is traced at all, in (0, 1]: Russian roulette before its first ray. A path that it ends
+    /// counts in the image, as black, and in nothing else; all others count 1 ÷ this.
+    pub survival: f32,
     /// Share of uniform paths in the mixture, in [0, 1]; `None`: the guide's own, or what a chooser found best.
     pub uniform_fraction: Option<f32>,
     /// Samples per pixel of the pilot; `None`: for a guide that is refined from pass to pass a thirty-second of `Spp`, or of
@@ -135,6 +138,7 @@ impl Default for Options {
             strategy: EmitterStrategy::default(),
             budget: Budget::Spp(16),
             snapshots: Vec::new(),
+            survival: 1.0,
             uniform_fraction: None,
             pilot_spp: None,
             keep_pilot: true,
@@ -154,6 +158,9 @@ impl Options {
         let error = |name, value: String, rule| Err(RenderError::Option { name, value, rule });
         if let Some(a) = self.uniform_fraction.filter(|a| !(0.0..=1.0).contains(a)) {
             return error("uniform_fraction", a.to_string(), "in [0, 1]");
+        }
+        if !(self.survival > 0.0 && self.survival <= 1.0) {
+            return error("survival", self.survival.to_string(), "in (0, 1]");
         }
         if self.k == 0 && !matches!(self.guide, GuideChoice::None) {
             return error("k", "0".to_owned(), "1 or more with a guide");

@@ -27,6 +27,8 @@ const CHUNK: u32 = 16;
 const BATCH: usize = 128;
 /// Block of a path's numbers that the lens uses, where the camera has one: far behind those of u.
 const LENS: u32 = u32::MAX;
+/// Block of the number that decides whether a path is traced at all.
+const ROULETTE: u32 = u32::MAX - 1;
 
 /// What all passes of a render share.
 pub(crate) struct PassContext<'a> {
@@ -34,6 +36,8 @@ pub(crate) struct PassContext<'a> {
     pub(crate) tracer: Tracer<'a>,
     /// Seed of the paths' numbers.
     pub(crate) seed: u64,
+    /// Probability that a path is traced.
+    pub(crate) survival: f32,
     /// Listener.
     pub(crate) progress: &'a dyn Progress,
     /// Threads.
@@ -50,10 +54,7 @@ pub(crate) fn path_numbers(
     width: usize,
     paths: &mut Paths,
 ) -> [f32; 2] {
-    // Numbered over the whole film: a crop renders the same samples as the full image.
-    let film = scene.film();
-    let [ox, oy] = film.crop_offset();
-    let index = (y + oy) * film.size()[0] + x + ox;
+    let index = index(scene, [x, y]);
     let block = |group: u32| stream.block(index, sample, group).map(to_unit);
     let [fx, fy, coin, thin] = block(0);
     paths.film.push([x as f32 + fx, y as f32 + fy]);
@@ -69,6 +70,13 @@ pub(crate) fn path_numbers(
         paths.lens.push([x, y]);
     }
     [coin, thin]
+}
+
+/// A pixel's number over the whole film: a crop renders the same samples as the full image.
+fn index(scene: &Scene, [x, y]: [u32; 2]) -> u32 {
+    let film = scene.film();
+    let [ox, oy] = film.crop_offset();
+    (y + oy) * film.size()[0] + x + ox
 }
 
 /// One pass.
@@ -191,26 +199,32 @@ impl PassContext<'_> {
         let total = u64::from(pixels) * u64::from(spp);
         let mut next = 0u64;
         while next < total {
-            let n = (total - next).min(BLOCK as u64);
             paths.film.clear();
             paths.lens.clear();
             paths.u.clear();
             coins.clear();
-            for i in next..next + n {
-                let (pixel, sample) = ((i / u64::from(spp)) as u32, (i % u64::from(spp)) as u32);
-                let (x, y) = (tile.x + pixel % tile.width, tile.y + pixel / tile.width);
-                let sample = first_sample + sample;
+            while next < total && coins.len() < BLOCK {
+                let (pixel, sample) = (next / u64::from(spp), next % u64::from(spp));
+                let (pixel, sample) = (pixel as u32, first_sample + sample as u32);
+                let at = [tile.x + pixel % tile.width, tile.y + pixel / tile.width];
+                next += 1;
+                if let Some(ended) = self.ended(&stream, at, sample) {
+                    piece.sums.add(film, ended, Rgb::ZERO, false);
+                    continue;
+                }
                 coins.push(path_numbers(
                     &stream,
                     scene,
-                    [x, y],
+                    at,
                     sample,
                     columns.width(),
                     &mut paths,
                 ));
             }
-            next += n;
 
+            if coins.is_empty() {
+                break;
+            }
             match &mut guided {
                 Some(numbers) => {
                     numbers.toss(coins.iter().map(|c| c[0]), mixture);
@@ -221,6 +235,21 @@ impl PassContext<'_> {
             self.collect(pass, &paths, &coins, mixture, &mut piece);
         }
         piece
+    }
+
+    /// Film position of a path that Russian roulette ends before its first ray.
+    #[inline]
+    fn ended(&self, stream: &Stream, [x, y]: [u32; 2], sample: u32) -> Option<[f32; 2]> {
+        if self.survival >= 1.0 {
+            return None;
+        }
+        let index = index(self.tracer.scene(), [x, y]);
+        let [xi, ..] = stream.block(index, sample, ROULETTE).map(to_unit);
+        if xi < self.survival {
+            return None;
+        }
+        let [fx, fy, ..] = stream.block(index, sample, 0).map(to_unit);
+        Some([x as f32 + fx, y as f32 + fy])
     }
 
     /// Divides a block by its densities and adds it to the film, the counts and the records.
@@ -270,9 +299,8 @@ impl PassContext<'_> {
                 piece.statistics.counts.non_finite += 1;
                 (f, estimate) = (Rgb::ZERO, Rgb::ZERO);
             }
-            piece
-                .sums
-                .add(film, paths.film[i], estimate, paths.found[i]);
+            let (at, found) = (paths.film[i], paths.found[i]);
+            piece.sums.add(film, at, estimate / self.survival, found);
             if f == Rgb::ZERO {
                 continue;
             }

@@ -282,7 +282,7 @@ impl Run<'_> {
         let pixels = self.context.tracer.scene().film().pixels() as f64;
         let threads = self.context.pool.current_num_threads();
         Left {
-            paths: spp * pixels,
+            paths: spp * pixels * f64::from(self.options.survival),
             seconds_per_path: each.map(|each| each * threads as f64 / pixels),
             threads,
             found: self.pilot.counts.paths_found as f64

@@ -211,3 +211,59 @@ fn a_snapshot_is_the_last_image_of_its_time_and_its_passes_replay_it() {
         assert_eq!(again.film.image, whole.film.image);
     }
 }
+
+/// Claim: paths that roulette ends are black samples of the image and nothing else, all others count 1 ÷ survival; the mean
+/// stays, and the variance that is told is that of the images.
+#[test]
+fn roulette_before_the_first_ray_loses_no_light() {
+    let scene = furnace(4);
+    let survive = |survival: f32, seed: u64| {
+        let options = Options {
+            survival,
+            seed,
+            budget: Budget::Spp(16),
+            threads: 1,
+            ..Options::default()
+        };
+        render(&scene, &options, &Silent).unwrap()
+    };
+    let renders = 400u32;
+    let mean = |survival: f32| -> (f64, f64, f64) {
+        let (mut sum, mut squares, mut told) = (0.0, 0.0, 0.0);
+        for seed in 0..renders {
+            let outcome = survive(survival, seed.into());
+            let (x, v) = (outcome.film.image[0], outcome.film.variance[0]);
+            sum += f64::from(x);
+            squares += f64::from(x) * f64::from(x);
+            told += f64::from(v);
+        }
+        let n = f64::from(renders);
+        (sum / n, squares / n - (sum / n).powi(2), told / n)
+    };
+    let (all, variance_all, _) = mean(1.0);
+    let (some, variance_some, told) = mean(0.25);
+    let error = ((variance_all + variance_some) / f64::from(renders)).sqrt();
+    assert!((all - some).abs() < 5.0 * error, "{all} {some} {error}");
+    assert!(
+        variance_some > 2.0 * variance_all,
+        "{variance_some} {variance_all}"
+    );
+    assert!(
+        (told / variance_some - 1.0).abs() < 0.4,
+        "{told} {variance_some}"
+    );
+    let traced = survive(0.25, 0).rendered.counts.camera_rays;
+    assert!((16..112).contains(&traced), "{traced} of 256");
+
+    for survival in [0.0, -1.0, 1.5, f32::NAN] {
+        let options = Options {
+            survival,
+            ..Options::default()
+        };
+        let error = render(&scene, &options, &Silent).unwrap_err().to_string();
+        assert!(
+            error.contains("survival") && error.contains("(0, 1]"),
+            "{error}"
+        );
+    }
+}
