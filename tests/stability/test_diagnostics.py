@@ -107,32 +107,37 @@ mi.set_variant("scalar_rgb")
 import pssflow
 from pssflow.study.stability.parts import room
 scene = pssflow.Scene(room(32))
-for name in sys.argv[2:]:
-    how = {"epochs": 2} if name == "mixture-net" else {}
-    np.save(f"{sys.argv[1]}-{name}.npy", scene.render(name, 64, seed=3, threads=1, progress=False, **how).image)
+for name in sys.argv[3:]:
+    guide = "none" if name == "none" else f"{sys.argv[1]}/{name}.guide"
+    np.save(f"{sys.argv[2]}-{name}.npy", scene.render(guide, 64, seed=3, threads=1, progress=False).image)
 """
 
 SAME = 1e-4
 """Relative difference of two pixels that only rounding explains."""
 
-OTHER_PATHS = {"none": 0.01, "table": 0.01, "mixture-net": 0.01}
+OTHER_PATHS = {"none": 0.01, "table": 0.001, "mixture-net": 0.001}
 """For random numbers the share of pixels that may differ by more than `SAME`; for guides the median pixel's change."""
 
 
 @pytest.mark.timeout(1200)
 def test_instruction_sets_agree(tmp_path: Path, record: dict[str, Any]) -> None:
-    """Embree rounds differently on AVX-512, AVX2 and SSE4.2; our own kernels do not use AVX-512.
+    """Embree rounds differently on AVX-512, AVX2 and SSE4.2, and so do our kernels without FMA.
 
     A path that grazes an edge may go another way. With random numbers that changes its own pixel alone: at most 1 % of
-    the pixels differ by more than 1e-4, and the mean by no more than 1e-4. Guides learn from such paths: there the
-    median pixel differs by at most 1 %, and so does the mean.
+    the pixels differ by more than 1e-4, and the mean by no more than 1e-4. A guide's numbers are rounded, too, and each
+    path with them: the median pixel differs by at most .1 %, and the mean. The guides are made once: what learns anew,
+    with one path more or less, is another guide.
     """
     flags = Path("/proc/cpuinfo").read_text(encoding="ascii") if sys.platform == "linux" else ""
     known = ["sse4.2", *(["avx2"] if "avx2" in flags else [])]
     known += ["avx512"] if "avx512vl" in flags else []
+    mi.set_variant(SCALAR)
+    pilot = pssflow.Scene(room(32)).pilot(spp=32, seed=1)
+    pilot.fit("table").save(tmp_path / "table.guide")
+    pilot.fit("mixture-net", epochs=2).save(tmp_path / "mixture-net.guide")
     for isa in known:
         subprocess.run(
-            [sys.executable, "-c", ISA, str(tmp_path / isa), *OTHER_PATHS],
+            [sys.executable, "-c", ISA, str(tmp_path), str(tmp_path / isa), *OTHER_PATHS],
             check=True,
             env={**os.environ, "PSSFLOW_ISA": isa},
             cwd=ROOT,
@@ -151,4 +156,4 @@ def test_instruction_sets_agree(tmp_path: Path, record: dict[str, Any]) -> None:
             record |= {f"{guide} {isa} share": differ, f"{guide} {isa} median": middle}
             record[f"{guide} {isa} mean"] = mean
             assert (differ if guide == "none" else middle) <= most, (guide, isa)
-            assert mean <= (1e-4 if guide == "none" else 0.01), (guide, isa)
+            assert mean <= (1e-4 if guide == "none" else 1e-3), (guide, isa)

@@ -20,8 +20,9 @@ const RARE_ERRORS: f64 = 2.0;
 /// Standard errors between the means of pilot and guided paths that are told.
 const MEAN_ERRORS: f64 = 4.0;
 
-/// Share of all light in a single path that is told, if there are at least so many paths.
+/// Share of all light in a single path, and effective number of paths, that are told, if there are at least so many paths.
 const ONE_PATH: f64 = 0.1;
+const FEW_PATHS: f64 = 50.0;
 const ENOUGH_PATHS: u64 = 10_000;
 
 /// Share of the pixels whose energy is told: the brightest ones.
@@ -234,9 +235,12 @@ impl Diagnostics {
                 means.z
             ));
         }
-        if self.largest_share > ONE_PATH && paths >= ENOUGH_PATHS {
+        let few = self.ess > 0.0 && self.ess < FEW_PATHS;
+        if (few || self.largest_share > ONE_PATH) && paths >= ENOUGH_PATHS {
             worries.push(format!(
-                "a single path carries {:.0} % of all light: the variance estimate is not to be trusted",
+                "the image rests on {:.0} effective paths, and a single one carries {:.0} % of all light: the variance estimate \
+                 is not to be trusted",
+                self.ess,
                 100.0 * self.largest_share
             ));
         }
@@ -394,6 +398,31 @@ mod tests {
     }
 
     #[test]
+    fn an_image_that_rests_on_few_paths_is_told() {
+        let film = film(vec![1.0; 3]);
+        let warned = |lit: u32, rays: u64| {
+            let mut side = Statistics::default();
+            side.counts.camera_rays = rays;
+            for _ in 0..lit {
+                side.add_estimate(Rgb::ONE, 1.0, 1.0);
+            }
+            let found = Diagnostics::of(&Evidence {
+                in_image: &side,
+                pilot: &Statistics::default(),
+                rendered: &side,
+                pools: &Pools::default(),
+                mass_outside: None,
+                film: &film,
+            });
+            found.warnings.len()
+        };
+        assert_eq!(warned(20, 20_000), 1);
+        assert_eq!(warned(20, 1000), 0);
+        assert_eq!(warned(60, 20_000), 0);
+        assert_eq!(warned(0, 20_000), 0);
+    }
+
+    #[test]
     fn a_pilot_and_a_guide_that_disagree_in_the_mean_are_told() {
         let side = |n: u64, lit: u64, guided: u64| {
             let mut side = Statistics {
@@ -421,6 +450,7 @@ mod tests {
         let same = side(10_000, 990, 10_000);
         assert_eq!(Diagnostics::of(&evidence(&same)).warnings, [""; 0]);
     }
+
     #[test]
     fn a_tail_is_told_where_it_is_heavy_beyond_its_error() {
         let film = film(vec![1.0; 3]);
