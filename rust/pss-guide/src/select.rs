@@ -308,7 +308,7 @@ fn consider(
 /// What a guide must gain on a prediction from so many light-carrying paths: the best of many candidates is the one that
 /// chance favours, by about so much.
 fn least_gain(held: usize) -> f64 {
-    LEAST_GAIN + 4.0 / (held.max(1) as f64).sqrt()
+    LEAST_GAIN + 5.0 / (held.max(1) as f64).sqrt()
 }
 
 /// Seconds that the paths which are left take on all threads.
