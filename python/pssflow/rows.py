@@ -126,11 +126,11 @@ def _of_paths(contexts: Mapping[str, ArrayLike], n: int) -> dict[str, NDArray[An
         if emitter.dtype.kind not in "iu":
             raise ValueError(f"contexts['emitter'] holds {emitter.dtype}; expected integers")
         arrays["emitter"] = emitter.astype(np.uint32)
-    k = arrays["position"].shape[1] if arrays["position"].ndim == 3 else 0
+    k = arrays["position"].shape[1] if arrays["position"].ndim == 3 else None
     expected = {**dict.fromkeys(vertices, (n, k, 3)), "pixel": (n, 2), "emitter": (n,)}
     for name, array in arrays.items():
-        if k == 0 or array.shape != expected[name]:
-            shape = str(expected[name]) if k else f"({n}, k, 3), k ≥ 1"
+        if k is None or array.shape != expected[name]:
+            shape = f"({n}, k, 3)" if k is None else str(expected[name])
             raise ValueError(f"contexts[{name!r}] has shape {array.shape}; expected {shape}")
     return arrays
 

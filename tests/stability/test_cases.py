@@ -42,6 +42,8 @@ def _findings(
 
 def _check(name: str, found: dict[str, Finding], record: dict[str, Any]) -> None:
     """What must hold of each guide; what it came to is recorded either way."""
+    if not found:
+        pytest.skip("the case has nothing to do with these guides")
     for guide, finding in found.items():
         record |= {f"{guide} {number}": value for number, value in finding.numbers.items()}
         record[f"{guide} verdict"] = f"{finding.verdict}: {finding.figure}"

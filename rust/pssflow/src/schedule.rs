@@ -248,7 +248,8 @@ impl Run<'_> {
     /// Share of the light-carrying paths of a pass of `spp` to keep, as many as [`Self::most_kept`] if about as many carry
     /// light as in the pass before. At random, since every other rule would prefer a part of the image.
     fn record_share(&self, kind: PassKind, spp: u32) -> f32 {
-        let paths = self.context.tracer.scene().film().pixels() as f64 * f64::from(spp);
+        let traced = f64::from(spp) * f64::from(self.options.survival);
+        let paths = self.context.tracer.scene().film().pixels() as f64 * traced;
         let guided = |p: &PassPlan| p.kind == PassKind::Guided;
         let more = match self.passes.last() {
             None => 1.0,
@@ -277,13 +278,15 @@ impl Run<'_> {
         }
     }
 
-    /// What is left of the budget: samples per pixel, and the measured seconds of one on all threads.
+    /// What is left of the budget: samples per pixel, of which roulette lets a share be traced, and the measured seconds of
+    /// one on all threads.
     fn left(&self, spp: f64, each: Option<f64>) -> Left {
         let pixels = self.context.tracer.scene().film().pixels() as f64;
+        let traced = pixels * f64::from(self.options.survival);
         let threads = self.context.pool.current_num_threads();
         Left {
-            paths: spp * pixels * f64::from(self.options.survival),
-            seconds_per_path: each.map(|each| each * threads as f64 / pixels),
+            paths: spp * traced,
+            seconds_per_path: each.map(|each| each * threads as f64 / traced),
             threads,
             found: self.pilot.counts.paths_found as f64
                 / (self.pilot.counts.camera_rays as f64).max(1.0),

@@ -129,7 +129,11 @@ impl Product<'_, '_> {
             for r in 0..R {
                 stored[r] = sum[r];
             }
-            for (r, row) in tile.chunks_exact(width).take(self.m - top).enumerate() {
+            for (r, row) in tile
+                .chunks_exact(width)
+                .take(R.min(self.m - top))
+                .enumerate()
+            {
                 self.c[(top + r) * self.n + first..][..used].copy_from_slice(&row[..used]);
             }
         }

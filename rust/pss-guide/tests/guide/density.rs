@@ -45,8 +45,8 @@ fn samples_follow_the_density() {
         for case in cases(&**guide) {
             let p = common::chi_square(&**guide, case, 0.0);
             assert!(p > 1e-4, "{}, {case:?}: p = {p:.2e}", spec.name);
-            // The test of the test: a tenth of the samples replaced by uniform ones is seen, unless all are uniform.
-            seen |= common::chi_square(&**guide, case, 0.1) < 1e-4;
+            // The test of the test: 3 % of the samples replaced by uniform ones are seen, unless all are uniform.
+            seen |= common::chi_square(&**guide, case, 0.03) < 1e-4;
         }
         assert!(seen, "{}: a wrong sampler passes", spec.name);
     }
