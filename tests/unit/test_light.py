@@ -290,6 +290,20 @@ def test_chance_goes_by_the_seed_alone(scene):
     assert (ended[0] != ended[1]).any()
 
 
+def test_a_length_is_repeated_alone(scene):
+    """Its record holds the chance that its paths had, as well as its passes."""
+    whole = _render(scene, "auto", spp=4, max_depth=9, rr_depth=2)
+    assert whole.parts[8].stats["survival"] < 0.5
+    for part in (whole.parts[2], whole.parts[8]):
+        again = pssflow.render(scene, replay=part.stats, progress=False)
+        for name in ("image", "variance", "found"):
+            np.testing.assert_array_equal(getattr(part, name), getattr(again, name))
+        assert again.stats["survival"] == part.stats["survival"]
+    damaged = whole.parts[8].stats | {"survival": 0.0}
+    with pytest.raises(ValueError, match=r"`survival` = 0\.0: expected a number in \(0, 1\]"):
+        pssflow.render(scene, replay=damaged, progress=False)
+
+
 def _plan(time: float) -> Plan:
     return Plan.make(learns=False, time=time)
 
