@@ -11,6 +11,7 @@ traced with probability s and then counts 1 ÷ s, which is Russian roulette befo
 from __future__ import annotations
 
 import json
+import math
 import time as clock
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -36,6 +37,9 @@ ODD = 0x9E3779B97F4A7C15
 
 LEAST_CHANCES = 4
 """Samples per pixel that share what is left to chance, at least: of a single one no variance is known."""
+
+CHANCES = 1 << 24
+"""Numbers that the core decides with, equally likely: a chance is so many of them, at least one."""
 
 
 def check_depth(max_depth: Any, choice: Choice, plan: Plan, preset: str | None) -> int:
@@ -226,14 +230,20 @@ def _left_to_chance(plan: Plan, wanted: float) -> Plan:
     if wanted >= 0.5 * LEAST_CHANCES:
         return plan
     spp = None if plan.spp is None else LEAST_CHANCES
-    return replace(plan, spp=spp, survival=wanted / LEAST_CHANCES)
+    # Rounded up, so that a path counts 1 ÷ the very share of the core's numbers that lets it live.
+    chances = max(math.ceil(wanted / LEAST_CHANCES * CHANCES), 1)
+    return replace(plan, spp=spp, survival=chances / CHANCES)
 
 
 def _speed(parts: Sequence[_Part], results: Sequence[Result]) -> float:
-    """Rays a second of what was rendered so far."""
-    done = list(zip(parts, results, strict=False))
-    rays = sum(result.stats["camera_rays"] * part.probe["rays"] for part, result in done)
-    return rays / max(sum(result.stats["seconds"]["render"] for _, result in done), 1e-9)
+    """Rays a second of what was rendered so far, pilots inside: where there is little time there is nothing else."""
+    done = [(part, result.stats) for part, result in zip(parts, results, strict=False)]
+    rays = sum(
+        (stats["camera_rays"] + stats["pilot"]["camera_rays"]) * part.probe["rays"]
+        for part, stats in done
+    )
+    seconds = sum(stats["seconds"]["pilot"] + stats["seconds"]["render"] for _, stats in done)
+    return rays / max(seconds, 1e-9)
 
 
 def _too_few(choice: Choice, plan: Plan) -> bool:
