@@ -41,6 +41,9 @@ LEAST_CHANCES = 4
 CHANCES = 1 << 24
 """Numbers that the core decides with, equally likely: a chance is so many of them, at least one."""
 
+PROBED_BEHIND = 2
+"""Lengths behind `rr_depth` that are looked at, here as in `lengths.rs`; those behind them are taken as they are."""
+
 
 def check_depth(max_depth: Any, choice: Choice, plan: Plan, preset: str | None) -> int:
     """`max_depth` as it is, if it can be rendered with these arguments.
@@ -132,10 +135,12 @@ def render_light(
 def _probe(scene: Scene, plan: Plan, max_depth: int, rr_depth: int | None) -> list[_Part]:
     # What is hidden from the camera has nothing to render at k = 0.
     first = 1 if scene.hide_emitters and max_depth > 1 else 0
+    last = max_depth if rr_depth is None else rr_depth + PROBED_BEHIND
     lengths = []
+    strategy = "nee"
     for k in range(first, max_depth):
-        strategy = "nee"
-        if k > 0:
+        # Far behind `rr_depth` little is spent and the last strategy kept: finding one would not pay.
+        if 0 < k <= last:
             strategy, _ = scene.resolve_strategy(
                 plan.emitter_strategy, k, plan.parametrisation, plan.threads or None
             )

@@ -327,6 +327,24 @@ def test_a_chance_is_one_that_the_core_can_give(scene):
         assert 0.0 <= 4.0 * survival - wanted <= 4.0 / 2**24
 
 
+def test_what_is_far_behind_the_roulette_is_not_looked_at(scene, monkeypatch):
+    """Neither for its share nor for how its light is joined."""
+    looked: list[int] = []
+
+    def resolve(strategy: str, k: int, *_: Any) -> tuple[str, str]:
+        looked.append(k)
+        return ("nee" if k == 4 else "mis"), strategy
+
+    monkeypatch.setattr(scene, "resolve_strategy", resolve)
+    plan = Plan.make(learns=False, spp=1, emitter_strategy="auto")
+    parts = light._probe(scene, plan, 12, 2)
+    assert looked == [1, 2, 3, 4]
+    assert [part.strategy for part in parts] == ["nee", *["mis"] * 3, *["nee"] * 8]
+    looked.clear()
+    light._probe(scene, plan, 6, None)
+    assert looked == [1, 2, 3, 4, 5]
+
+
 def _plan(time: float) -> Plan:
     return Plan.make(learns=False, time=time)
 
