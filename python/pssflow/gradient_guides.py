@@ -187,8 +187,8 @@ def _derivatives(
         known = [part for part in parts if dr.grad_enabled(part)]
         with _directions(params, rng if at_random else None):
             if known:
-                # The parameters' own gradients stay.
-                dr.forward_to(*known, flags=dr.ADFlag.ClearEdges | dr.ADFlag.ClearInterior)
+                # Gradients stay: the parameters' own, and those of what they are computed from.
+                dr.forward_to(*known, flags=dr.ADFlag.ClearEdges)
             n = len(drawn["u"])
             return [
                 np.broadcast_to(np.array(dr.grad(part), np.float32).reshape(3, -1).T, (n, 3))
@@ -198,31 +198,36 @@ def _derivatives(
 
 @contextmanager
 def _directions(params: Any, rng: np.random.Generator | None) -> Iterator[None]:
-    """Gives each component of each parameter a gradient of ±1 for a while; without a generator they keep theirs."""
+    """Gives each variable of the parameters a gradient of ±1 for a while; without a generator they keep theirs.
+
+    Components may share a variable, as in a grey made of one number: it has one gradient and one sign.
+    """
     if rng is None:
         yield
         return
-    names = [name for name in params.keys() if dr.grad_enabled(params[name])]  # noqa: SIM118
-    before = {name: dr.grad(params[name]) for name in names}
-    for name in names:
-        value = params[name]
-        signs = rng.choice(np.array([-1.0, 1.0], np.float32), dr.width(dr.ravel(value)))
-        dr.set_grad(value, _like(value, signs))
+    enabled = [params[name] for name in params.keys() if dr.grad_enabled(params[name])]  # noqa: SIM118
+    variables = {flat.index_ad: flat for value in enabled for flat in _flat(value)}
+    before = [(flat, dr.grad(flat)) for flat in variables.values()]
+    for flat, _ in before:
+        numbers: Any = dr.detached_t(type(flat))
+        signs = rng.choice(np.array([-1.0, 1.0], np.float32), dr.width(flat))
+        dr.set_grad(flat, numbers(signs))
     try:
         yield
     finally:
-        for name, grad in before.items():
-            dr.set_grad(params[name], grad)
+        for flat, grad in before:
+            dr.set_grad(flat, grad)
 
 
-def _like(value: Any, flat: F32) -> Any:
-    """Numbers in the type and the shape of a parameter."""
-    kind: Any = dr.detached_t(type(value))
-    scalar: Any = dr.detached_t(type(dr.ravel(value)))
-    numbers = scalar(flat)
+def _flat(value: Any) -> Iterator[Any]:
+    """The components of a parameter that have gradients, each a plain array."""
     if dr.is_tensor_v(value):
-        return kind(numbers, shape=value.shape)
-    return dr.unravel(kind, numbers) if dr.depth_v(value) > 1 else kind(numbers)
+        value = value.array
+    if dr.depth_v(value) > 1:
+        for component in value:
+            yield from _flat(component)
+    elif dr.grad_enabled(value):
+        yield value
 
 
 def _magnitude(derivative: F32, of_loss: F32 | None) -> F32:

@@ -134,9 +134,8 @@ def forward(
     """
     total = None
     for image, share in _images(ours, result, sensor, seed, spp, parametrisation, target):
-        # The parameters' own gradients stay: later passes need them, too.
-        kept = dr.ADFlag.ClearEdges | dr.ADFlag.ClearInterior | dr.ADFlag.AllowNoGrad
-        dr.forward_to(image, flags=kept)
+        # Gradients stay: later passes need those of the parameters, too, which may be computed from other variables.
+        dr.forward_to(image, flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad)
         part = dr.detach(dr.grad(image)) * share
         total = part if total is None else total + part
         dr.eval(total)

@@ -11,6 +11,7 @@ traced with probability s and then counts 1 ÷ s, which is Russian roulette befo
 from __future__ import annotations
 
 import json
+import math
 import time as clock
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -36,6 +37,12 @@ ODD = 0x9E3779B97F4A7C15
 
 LEAST_CHANCES = 4
 """Samples per pixel that share what is left to chance, at least: of a single one no variance is known."""
+
+CHANCES = 1 << 24
+"""Numbers that the core decides with, equally likely: a chance is so many of them, at least one."""
+
+PROBED_BEHIND = 2
+"""Lengths behind `rr_depth` that are looked at, here as in `lengths.rs`; those behind them are taken as they are."""
 
 
 def check_depth(max_depth: Any, choice: Choice, plan: Plan, preset: str | None) -> int:
@@ -128,10 +135,12 @@ def render_light(
 def _probe(scene: Scene, plan: Plan, max_depth: int, rr_depth: int | None) -> list[_Part]:
     # What is hidden from the camera has nothing to render at k = 0.
     first = 1 if scene.hide_emitters and max_depth > 1 else 0
+    last = max_depth if rr_depth is None else rr_depth + PROBED_BEHIND
     lengths = []
+    strategy = "nee"
     for k in range(first, max_depth):
-        strategy = "nee"
-        if k > 0:
+        # Far behind `rr_depth` little is spent and the last strategy kept: finding one would not pay.
+        if 0 < k <= last:
             strategy, _ = scene.resolve_strategy(
                 plan.emitter_strategy, k, plan.parametrisation, plan.threads or None
             )
@@ -226,14 +235,20 @@ def _left_to_chance(plan: Plan, wanted: float) -> Plan:
     if wanted >= 0.5 * LEAST_CHANCES:
         return plan
     spp = None if plan.spp is None else LEAST_CHANCES
-    return replace(plan, spp=spp, survival=wanted / LEAST_CHANCES)
+    # Rounded up, so that a path counts 1 ÷ the very share of the core's numbers that lets it live.
+    chances = max(math.ceil(wanted / LEAST_CHANCES * CHANCES), 1)
+    return replace(plan, spp=spp, survival=chances / CHANCES)
 
 
 def _speed(parts: Sequence[_Part], results: Sequence[Result]) -> float:
-    """Rays a second of what was rendered so far."""
-    done = list(zip(parts, results, strict=False))
-    rays = sum(result.stats["camera_rays"] * part.probe["rays"] for part, result in done)
-    return rays / max(sum(result.stats["seconds"]["render"] for _, result in done), 1e-9)
+    """Rays a second of what was rendered so far, pilots inside: where there is little time there is nothing else."""
+    done = [(part, result.stats) for part, result in zip(parts, results, strict=False)]
+    rays = sum(
+        (stats["camera_rays"] + stats["pilot"]["camera_rays"]) * part.probe["rays"]
+        for part, stats in done
+    )
+    seconds = sum(stats["seconds"]["pilot"] + stats["seconds"]["render"] for _, stats in done)
+    return rays / max(seconds, 1e-9)
 
 
 def _too_few(choice: Choice, plan: Plan) -> bool:

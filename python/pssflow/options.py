@@ -114,6 +114,7 @@ class Plan:
         preset: str | None = None,
         replay: Sequence[Mapping[str, Any]] | None = None,
         snapshots: Sequence[float] = (),
+        survival: float = 1.0,
     ) -> Plan:
         """Checks the arguments of a render and fills in defaults.
 
@@ -171,6 +172,7 @@ class Plan:
             threads=check_threads(threads),
             replay=passes,
             snapshots=check_snapshots(snapshots, time),
+            survival=survival,
         )
 
     def core(self, guide: str, guide_options: Mapping[str, Any], strategy: str) -> str:
@@ -344,7 +346,7 @@ def read_replay(replay: str | os.PathLike[str] | Mapping[str, Any]) -> dict[str,
     missing += [key for length in lengths for key in REPLAYED if key not in length]
     if missing:
         raise ValueError(f"{where}: lacks `{missing[0]}`; expected the record that `--json` prints")
-    told = {key: stats[key] for key in REPLAYED}
+    told = {key: stats[key] for key in REPLAYED} | {"survival": _survival(stats)}
     if lengths:
         told["max_depth"] = check_integer("max_depth", stats.get("max_depth"), 1, MAX_BOUNCES + 1)
         if stats.get("rr_depth") is not None:
@@ -362,10 +364,15 @@ def _length(record: Mapping[str, Any]) -> dict[str, Any]:
         "passes": check_passes(record["passes"]),
         "k": check_integer("k", record["k"], 0, MAX_BOUNCES),
         "seed": check_integer("seed", record["seed"], 0, 2**64 - 1),
-        "survival": check_number("survival", record.get("survival", 1.0), 0.0, 1.0, above=True),
+        "survival": _survival(record),
         "a": check_number("a", record["a"], 0.0, 1.0),
         "emitter_strategy": check_choice(
             "emitter_strategy", record["emitter_strategy"], EMITTER_STRATEGIES
         ),
         "probe": probe,
     }
+
+
+def _survival(record: Mapping[str, Any]) -> float:
+    """What only a length of a whole light has below 1; the sum of all has none."""
+    return check_number("survival", record.get("survival", 1.0), 0.0, 1.0, above=True)

@@ -304,7 +304,15 @@ def _replayed(
 
     A record knows a foreign object's class only, so that object must be given again.
     """
-    names = ("k", "parametrisation", "emitter_strategy", "keep_pilot", "combine", "seed")
+    names = (
+        "k",
+        "parametrisation",
+        "emitter_strategy",
+        "keep_pilot",
+        "combine",
+        "seed",
+        "survival",
+    )
     settings.update({name: record[name] for name in names}, uniform_fraction=record["a"])
     if guide is None or isinstance(guide, (str, os.PathLike)):
         guide = record["guide"]

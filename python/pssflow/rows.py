@@ -156,6 +156,8 @@ def _vertices(contexts: Mapping[str, NDArray[Any]], rows: NDArray[np.bool_]) -> 
 
 def _intervals(emitters: ArrayLike) -> list[tuple[float, bool]]:
     array = np.asarray(emitters, np.float32)
+    if array.size == 0:
+        return []
     if array.ndim != 2 or array.shape[1] != 2:
         raise ValueError(f"`emitters` has shape {array.shape}; expected (m, 2)")
     return [(float(end), bool(surrounds)) for end, surrounds in array]

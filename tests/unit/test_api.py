@@ -172,6 +172,15 @@ def test_tables_are_fitted_and_asked_in_python(furnace):
     assert abs(weights.mean() - 1) < 5 * weights.std() / np.sqrt(n) + 1e-6
 
 
+@pytest.mark.parametrize("none", [None, [], (), np.empty((0, 2))])
+def test_no_emitters_may_be_an_empty_list(none):
+    u = np.random.default_rng(4).random((50, 5), np.float32)
+    guide = pssflow.Guide.fit("realnvp-logit", u, np.ones(50, np.float32), emitters=none, epochs=1)
+    assert np.isfinite(guide.log_prob(u)).all()
+    with pytest.raises(ValueError, match=r"`emitters` has shape \(3,\); expected \(m, 2\)"):
+        pssflow.Guide.fit("realnvp-logit", u, np.ones(50, np.float32), emitters=[1.0, 0.0, 1.0])
+
+
 def test_a_guide_that_looks_says_what_it_misses(furnace):
     pilot = furnace.pilot(spp=4, k=2)
     guide = pilot.fit("direction-table")

@@ -264,7 +264,7 @@ def test_long_paths_are_left_to_chance(scene):
             assert (length["survival"], length["spp"]) == (1.0, round(expected))
             continue
         assert length["spp"] == 4
-        assert length["spp"] * length["survival"] == pytest.approx(expected, rel=1e-5)
+        assert length["spp"] * length["survival"] == pytest.approx(expected, abs=4.0 / 2**24)
         traced = length["camera_rays"]
         spread = (paths * length["survival"] * (1.0 - length["survival"])) ** 0.5
         assert abs(traced - paths * length["survival"]) <= 5.0 * spread
@@ -288,6 +288,61 @@ def test_chance_goes_by_the_seed_alone(scene):
     ]
     assert ended[0].any()
     assert (ended[0] != ended[1]).any()
+
+
+def test_a_length_is_repeated_alone(scene):
+    """Its record holds the chance that its paths had, as well as its passes."""
+    whole = _render(scene, "auto", spp=4, max_depth=9, rr_depth=2)
+    assert whole.parts[8].stats["survival"] < 0.5
+    for part in (whole.parts[2], whole.parts[8]):
+        again = pssflow.render(scene, replay=part.stats, progress=False)
+        for name in ("image", "variance", "found"):
+            np.testing.assert_array_equal(getattr(part, name), getattr(again, name))
+        assert again.stats["survival"] == part.stats["survival"]
+    damaged = whole.parts[8].stats | {"survival": 0.0}
+    with pytest.raises(ValueError, match=r"`survival` = 0\.0: expected a number in \(0, 1\]"):
+        pssflow.render(scene, replay=damaged, progress=False)
+
+
+@pytest.mark.parametrize("guide", ["auto", "table"])
+def test_a_pilot_may_be_all_there_was(guide, llvm_variant):
+    """Its rays tell what there is time for: with hidden emitters the first length is its pilot and nothing else."""
+    room = mi.load_dict(scenes.furnace_sphere())
+    # So many pixels that there is no time for a second sample.
+    hidden = pssflow.Scene(room, size=(256, 256), hide_emitters=True)
+    stats = _render(hidden, guide, time=1e-3, max_depth=6, rr_depth=2, threads=1).stats
+    lengths = stats["lengths"]
+    assert lengths[0]["camera_rays"] == 0 < lengths[0]["pilot"]["camera_rays"]
+    assert all(0.0 < length["survival"] <= 1.0 for length in lengths)
+    assert lengths[4]["survival"] < 1.0
+
+
+def test_a_chance_is_one_that_the_core_can_give(scene):
+    """The core's numbers have 24 bits: a path that lived more often than it says would count too much."""
+    plan = Plan.make(learns=False, spp=4)
+    for wanted in (0.0, 1e-12, 1e-7, 0.1, 1.9):
+        survival = light._left_to_chance(plan, wanted).survival
+        assert 0.0 < survival == np.float32(survival)
+        assert (survival * 2**24).is_integer()
+        assert 0.0 <= 4.0 * survival - wanted <= 4.0 / 2**24
+
+
+def test_what_is_far_behind_the_roulette_is_not_looked_at(scene, monkeypatch):
+    """Neither for its share nor for how its light is joined."""
+    looked: list[int] = []
+
+    def resolve(strategy: str, k: int, *_: Any) -> tuple[str, str]:
+        looked.append(k)
+        return ("nee" if k == 4 else "mis"), strategy
+
+    monkeypatch.setattr(scene, "resolve_strategy", resolve)
+    plan = Plan.make(learns=False, spp=1, emitter_strategy="auto")
+    parts = light._probe(scene, plan, 12, 2)
+    assert looked == [1, 2, 3, 4]
+    assert [part.strategy for part in parts] == ["nee", *["mis"] * 3, *["nee"] * 8]
+    looked.clear()
+    light._probe(scene, plan, 6, None)
+    assert looked == [1, 2, 3, 4, 5]
 
 
 def _plan(time: float) -> Plan:
