@@ -250,6 +250,9 @@ class Scene:
     def rays_alone(self, *, spp: int, k: int, threads: int = 0) -> dict[str, float]:
         """Times only the Embree queries that rendering makes: {"seconds", "rays", "rays_per_path"}."""
 
+def last_probed(rr_depth: int) -> int:
+    """The longest path length that `Scene.lengths` probes."""
+
 def guide_aliases() -> str:
     """Names that stand for several guides, JSON: {name: guides joined by `+`}."""
 

@@ -41,9 +41,6 @@ LEAST_CHANCES = 4
 CHANCES = 1 << 24
 """Numbers that the core decides with, equally likely: a chance is so many of them, at least one."""
 
-PROBED_BEHIND = 2
-"""Lengths behind `rr_depth` that are looked at, here as in `lengths.rs`; those behind them are taken as they are."""
-
 
 def check_depth(max_depth: Any, choice: Choice, plan: Plan, preset: str | None) -> int:
     """`max_depth` as it is, if it can be rendered with these arguments.
@@ -135,7 +132,7 @@ def render_light(
 def _probe(scene: Scene, plan: Plan, max_depth: int, rr_depth: int | None) -> list[_Part]:
     # What is hidden from the camera has nothing to render at k = 0.
     first = 1 if scene.hide_emitters and max_depth > 1 else 0
-    last = max_depth if rr_depth is None else rr_depth + PROBED_BEHIND
+    last = max_depth if rr_depth is None else _core.last_probed(rr_depth)
     lengths = []
     strategy = "nee"
     for k in range(first, max_depth):

@@ -41,7 +41,7 @@ pub use kernel::isa;
 pub use net::options::{MixtureNetOptions, NetOptions, SplineNetOptions};
 pub use options::Condition;
 pub use recipe::{ALIASES, Recipe};
-pub use records::{Emitter, Records};
+pub use records::{Emitter, OwnedRecords, Records};
 pub use registry::{FitFn, GuideSpec, find, fit, registry};
 pub use select::{CandidateReport, Remaining, Selection, candidates, recall, select};
 pub use table::options::{EmitterTableOptions, TableOptions};

@@ -63,6 +63,68 @@ pub struct Records<'a> {
     pub zeros: u64,
 }
 
+/// What [`Records`] borrows, row by row; columns as there.
+#[derive(Clone, Debug, Default)]
+pub struct OwnedRecords {
+    /// As in [`Records`].
+    pub u: Vec<f32>,
+    /// As in [`Records`].
+    pub f: Vec<f32>,
+    /// As in [`Records`].
+    pub f_bsdf: Vec<f32>,
+    /// As in [`Records`].
+    pub f_max: Vec<f32>,
+    /// As in [`Records`].
+    pub ray: Vec<[f32; 2]>,
+    /// As in [`Records`].
+    pub g: Vec<f32>,
+    /// As in [`Records`].
+    pub g_bsdf: Vec<f32>,
+    /// As in [`Records`].
+    pub g_both: Vec<f32>,
+    /// As in [`Records`].
+    pub contexts: Vec<Context>,
+    /// As in [`Records`].
+    pub pixel: Vec<[f32; 2]>,
+}
+
+impl OwnedRecords {
+    /// What a guide learns from: these rows of so many numbers each, and `zeros` paths that are not given.
+    pub fn view<'a>(&'a self, dims: usize, emitters: &'a [Emitter], zeros: u64) -> Records<'a> {
+        Records {
+            dims,
+            u: &self.u,
+            f: &self.f,
+            f_bsdf: &self.f_bsdf,
+            f_max: &self.f_max,
+            ray: &self.ray,
+            g: &self.g,
+            g_bsdf: &self.g_bsdf,
+            g_both: &self.g_both,
+            contexts: &self.contexts,
+            pixel: &self.pixel,
+            emitters,
+            zeros,
+        }
+    }
+
+    /// Copies a row.
+    pub(crate) fn push(&mut self, records: &Records<'_>, row: usize) {
+        let (d, k) = (records.dims, records.bounces());
+        self.u.extend_from_slice(&records.u[row * d..][..d]);
+        self.f.push(records.f[row]);
+        self.f_max.push(records.f_max[row]);
+        self.g.push(records.g[row]);
+        self.f_bsdf.extend(records.f_bsdf.get(row));
+        self.ray.extend(records.ray.get(row));
+        self.g_bsdf.extend(records.g_bsdf.get(row));
+        self.g_both.extend(records.g_both.get(row));
+        let vertices = records.contexts.get(row * k..(row + 1) * k);
+        self.contexts.extend(vertices.unwrap_or_default());
+        self.pixel.extend(records.pixel.get(row));
+    }
+}
+
 /// One path's luminances and the densities of the numbers that each term uses.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Terms {

@@ -14,7 +14,8 @@ use serde::Serialize;
 use serde_json::{Map, json};
 
 use crate::predict::{Densities, HeldOut};
-use crate::{Context, Decision, Emitter, Fit, Guide, GuideError, Recipe, Records};
+use crate::records::OwnedRecords;
+use crate::{Context, Decision, Fit, Guide, GuideError, Recipe, Records};
 
 /// Shares of uniform paths that are tried.
 const FRACTIONS: [f32; 3] = [0.1, 0.25, 0.5];
@@ -188,12 +189,15 @@ pub fn select(
         }
     }
     considered.sort_by(|x, y| y.report.net_gain.total_cmp(&x.report.net_gain));
-    let pays = |c: &&Considered| c.pays(least);
-    let best = considered.iter().find(pays);
-    let best = best.map_or(1.0, |c| c.report.net_gain);
-    let smallest = (0..considered.len())
-        .filter(|&i| considered[i].pays(least) && considered[i].report.net_gain >= AS_GOOD * best)
-        .min_by_key(|&i| considered[i].size());
+    // By what they gain, the most first.
+    let mut paying: Vec<usize> = (0..considered.len())
+        .filter(|&i| considered[i].pays(least))
+        .collect();
+    let best = paying
+        .first()
+        .map_or(1.0, |&i| considered[i].report.net_gain);
+    paying.retain(|&i| considered[i].report.net_gain >= AS_GOOD * best);
+    let smallest = paying.into_iter().min_by_key(|&i| considered[i].size());
     let none = considered.iter().position(|c| c.recipe.is_none());
     let at = smallest.or(none).unwrap_or(0);
     explain(&mut considered, at, best, least);
@@ -412,58 +416,16 @@ fn explain(considered: &mut [Considered], at: usize, best: f64, least: f64) {
 /// Rows of records that were picked out.
 #[derive(Default)]
 struct Part {
-    u: Vec<f32>,
-    f: Vec<f32>,
-    f_bsdf: Vec<f32>,
-    f_max: Vec<f32>,
-    ray: Vec<[f32; 2]>,
-    g: Vec<f32>,
-    g_bsdf: Vec<f32>,
-    g_both: Vec<f32>,
-    contexts: Vec<Context>,
-    pixel: Vec<[f32; 2]>,
+    rows: OwnedRecords,
     /// Share of all rows that were meant to be picked.
     share: f64,
 }
 
 impl Part {
-    fn push(&mut self, records: &Records<'_>, row: usize) {
-        let (d, k) = (records.dims, records.bounces());
-        self.u.extend_from_slice(&records.u[row * d..][..d]);
-        self.f.push(records.f[row]);
-        self.f_max.push(records.f_max[row]);
-        self.g.push(records.g[row]);
-        self.f_bsdf.extend(records.f_bsdf.get(row));
-        self.ray.extend(records.ray.get(row));
-        self.g_bsdf.extend(records.g_bsdf.get(row));
-        self.g_both.extend(records.g_both.get(row));
-        self.contexts.extend(
-            records
-                .contexts
-                .get(row * k..(row + 1) * k)
-                .unwrap_or_default(),
-        );
-        self.pixel.extend(records.pixel.get(row));
-    }
-
     fn view<'a>(&'a self, records: &Records<'a>) -> Records<'a> {
-        let emitters: &'a [Emitter] = records.emitters;
         let paths = (records.paths() * self.share) as u64;
-        Records {
-            dims: records.dims,
-            u: &self.u,
-            f: &self.f,
-            f_bsdf: &self.f_bsdf,
-            f_max: &self.f_max,
-            g: &self.g,
-            ray: &self.ray,
-            g_bsdf: &self.g_bsdf,
-            g_both: &self.g_both,
-            contexts: &self.contexts,
-            pixel: &self.pixel,
-            emitters,
-            zeros: paths.saturating_sub(self.f.len() as u64),
-        }
+        let zeros = paths.saturating_sub(self.rows.f.len() as u64);
+        self.rows.view(records.dims, records.emitters, zeros)
     }
 }
 
@@ -479,9 +441,9 @@ fn split(records: &Records<'_>) -> (Part, Part) {
         // Scrambled, since the samples of a pixel lie next to each other.
         let scrambled = (i as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 32;
         if scrambled.is_multiple_of(HOLD_OUT) {
-            held.push(records, row);
+            held.rows.push(records, row);
         } else {
-            fitted_to.push(records, row);
+            fitted_to.rows.push(records, row);
         }
     }
     (fitted_to, held)

@@ -30,7 +30,7 @@ mod _core {
     #[pymodule_export]
     use super::output::{read_exr, write_exr};
     #[pymodule_export]
-    use super::scene::Scene;
+    use super::scene::{Scene, last_probed};
 
     use pyo3::prelude::*;
 

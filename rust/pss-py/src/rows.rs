@@ -1,7 +1,7 @@
 //! Paths to learn from, as Python gives them: a dictionary of arrays into [`Records`].
 
 use numpy::{PyReadonlyArray1, PyReadonlyArray2};
-use pss_guide::{Context, Emitter, Records};
+use pss_guide::{Emitter, OwnedRecords, Records};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
@@ -11,16 +11,7 @@ use crate::{arrays, contexts, errors};
 #[derive(Debug, Default)]
 pub(crate) struct Rows {
     dims: usize,
-    u: Vec<f32>,
-    f: Vec<f32>,
-    f_bsdf: Vec<f32>,
-    f_max: Vec<f32>,
-    ray: Vec<[f32; 2]>,
-    g: Vec<f32>,
-    g_bsdf: Vec<f32>,
-    g_both: Vec<f32>,
-    contexts: Vec<Context>,
-    pixel: Vec<[f32; 2]>,
+    rows: OwnedRecords,
     emitters: Vec<Emitter>,
     zeros: u64,
 }
@@ -28,7 +19,8 @@ pub(crate) struct Rows {
 impl Rows {
     /// Copies the arrays; what is missing or None is left out.
     pub(crate) fn of(dict: &Bound<'_, PyDict>) -> PyResult<Self> {
-        let mut rows = Self::default();
+        let mut all = Self::default();
+        let rows = &mut all.rows;
         let (mut vertices, mut has_f, mut has_u) = (None, false, false);
         for (key, value) in dict {
             if value.is_none() {
@@ -37,7 +29,7 @@ impl Rows {
             let name: String = key.extract()?;
             match name.as_str() {
                 "u" => {
-                    (rows.u, rows.dims) = arrays::matrix(&matrix(&name, &value)?);
+                    (rows.u, all.dims) = arrays::matrix(&matrix(&name, &value)?);
                     has_u = true;
                 }
                 "f" => {
@@ -52,8 +44,8 @@ impl Rows {
                 "ray" => rows.ray = arrays::rows::<2>(&matrix(&name, &value)?, &name)?,
                 "pixel" => rows.pixel = arrays::rows::<2>(&matrix(&name, &value)?, &name)?,
                 "contexts" => vertices = Some(value.cast_into::<PyDict>()?),
-                "emitters" => rows.emitters = contexts::emitters(value.extract()?),
-                "zeros" => rows.zeros = value.extract()?,
+                "emitters" => all.emitters = contexts::emitters(value.extract()?),
+                "zeros" => all.zeros = value.extract()?,
                 _ => return Err(errors::value(format!("records[{name:?}] is unknown"))),
             }
         }
@@ -61,7 +53,7 @@ impl Rows {
             return Err(errors::value("records lack `u` or `f`"));
         }
         let n = rows.f.len();
-        arrays::same_rows("u", rows.u.len() / rows.dims.max(1), n)?;
+        arrays::same_rows("u", rows.u.len() / all.dims.max(1), n)?;
         if rows.f_max.is_empty() {
             rows.f_max.clone_from(&rows.f);
         }
@@ -69,7 +61,7 @@ impl Rows {
             rows.g = vec![1.0; n];
         }
         if let Some(dict) = vertices {
-            rows.contexts = contexts::contexts(&dict, n * (rows.dims.saturating_sub(1) / 2))?;
+            rows.contexts = contexts::contexts(&dict, n * (all.dims.saturating_sub(1) / 2))?;
         }
         for (name, found) in [
             ("f_max", rows.f_max.len()),
@@ -84,31 +76,17 @@ impl Rows {
                 arrays::same_rows(name, found, n)?;
             }
         }
-        Ok(rows)
+        Ok(all)
     }
 
     /// Whether vertices were given.
     pub(crate) fn has_contexts(&self) -> bool {
-        !self.contexts.is_empty()
+        !self.rows.contexts.is_empty()
     }
 
     /// What a guide learns from.
     pub(crate) fn view(&self) -> Records<'_> {
-        Records {
-            dims: self.dims,
-            u: &self.u,
-            f: &self.f,
-            f_bsdf: &self.f_bsdf,
-            f_max: &self.f_max,
-            ray: &self.ray,
-            g: &self.g,
-            g_bsdf: &self.g_bsdf,
-            g_both: &self.g_both,
-            contexts: &self.contexts,
-            pixel: &self.pixel,
-            emitters: &self.emitters,
-            zeros: self.zeros,
-        }
+        self.rows.view(self.dims, &self.emitters, self.zeros)
     }
 }
 

@@ -66,6 +66,12 @@ fn always() -> f32 {
     1.0
 }
 
+/// The longest path length that `Scene.lengths` probes.
+#[pyfunction]
+pub(crate) fn last_probed(rr_depth: usize) -> usize {
+    pssflow::last_probed(rr_depth)
+}
+
 pub(crate) fn parametrisation(name: &str) -> PyResult<Parametrisation> {
     match name {
         "bsdf" => Ok(Parametrisation::Bsdf),

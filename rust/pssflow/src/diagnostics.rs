@@ -357,9 +357,20 @@ mod tests {
         assert_eq!(pools.second_moment(), None);
     }
 
+    /// What is told of a render without a pilot, of an image of one pixel.
+    fn of_one_side(side: &Statistics) -> Diagnostics {
+        Diagnostics::of(&Evidence {
+            in_image: side,
+            pilot: &Statistics::default(),
+            rendered: side,
+            pools: &Pools::default(),
+            mass_outside: None,
+            film: &film(vec![1.0; 3]),
+        })
+    }
+
     #[test]
     fn light_that_the_guide_draws_rarely_is_told() {
-        let film = film(vec![1.0; 3]);
         // Paths of which each brings one, with these weights.
         let found = |weights: &[f32]| {
             let mut side = Statistics {
@@ -370,14 +381,7 @@ mod tests {
             for &w in weights {
                 side.add_estimate(Rgb::ONE, w, f64::from(w));
             }
-            Diagnostics::of(&Evidence {
-                in_image: &side,
-                pilot: &Statistics::default(),
-                rendered: &side,
-                pools: &Pools::default(),
-                mass_outside: None,
-                film: &film,
-            })
+            of_one_side(&side)
         };
         let rare = found(&[8.0; 40]);
         assert_eq!(rare.warnings.len(), 1, "{:?}", rare.warnings);
@@ -399,22 +403,13 @@ mod tests {
 
     #[test]
     fn an_image_that_rests_on_few_paths_is_told() {
-        let film = film(vec![1.0; 3]);
         let warned = |lit: u32, rays: u64| {
             let mut side = Statistics::default();
             side.counts.camera_rays = rays;
             for _ in 0..lit {
                 side.add_estimate(Rgb::ONE, 1.0, 1.0);
             }
-            let found = Diagnostics::of(&Evidence {
-                in_image: &side,
-                pilot: &Statistics::default(),
-                rendered: &side,
-                pools: &Pools::default(),
-                mass_outside: None,
-                film: &film,
-            });
-            found.warnings.len()
+            of_one_side(&side).warnings.len()
         };
         assert_eq!(warned(20, 20_000), 1);
         assert_eq!(warned(20, 1000), 0);

@@ -42,6 +42,11 @@ pub struct Length {
 /// Lengths behind `rr_depth` that are probed, too; those behind them are foretold from the last two.
 const PROBED_BEHIND: usize = 2;
 
+/// The longest length that is probed where roulette begins behind `rr_depth`.
+pub fn last_probed(rr_depth: usize) -> usize {
+    rr_depth + PROBED_BEHIND
+}
+
 /// Probes `lengths`, which increase, with the strategy of each. Of those far behind `rr_depth`, on which little is spent, it
 /// is foretold what they are like: looking would cost more than it brings.
 ///
@@ -54,7 +59,7 @@ pub fn probe_lengths(
     rr_depth: Option<usize>,
     threads: usize,
 ) -> Result<Vec<Length>, RenderError> {
-    let last = rr_depth.map_or(usize::MAX, |depth| depth + PROBED_BEHIND);
+    let last = rr_depth.map_or(usize::MAX, last_probed);
     let near = lengths.partition_point(|&(k, _)| k <= last);
     let tracers = lengths[..near]
         .iter()

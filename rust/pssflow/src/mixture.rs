@@ -14,6 +14,15 @@ pub struct Mixture {
     pub uniform_fraction: f32,
 }
 
+/// f_nee and f_bsdf of a path, each with the guide's density of the numbers that it uses.
+pub type Terms = [(Rgb, f32); 2];
+
+/// Those that carry light: a term of zero stays zero, also where its density is zero.
+#[inline]
+fn lit(terms: Terms) -> impl Iterator<Item = (Rgb, f32)> {
+    terms.into_iter().filter(|&(f, _)| f != Rgb::ZERO)
+}
+
 impl Mixture {
     /// m for a product of guide densities `q`.
     #[inline]
@@ -32,15 +41,12 @@ impl Mixture {
     /// f ÷ m, each term by the density of the numbers that it uses, and the larger 1/m of the terms that
     /// carry light (0 where none does).
     #[inline]
-    pub fn divide(&self, f_nee: Rgb, q_nee: f32, f_bsdf: Rgb, q_bsdf: f32) -> (Rgb, f32) {
+    pub fn divide(&self, terms: Terms) -> (Rgb, f32) {
         let (mut estimate, mut weight) = (Rgb::ZERO, 0.0f32);
-        for (f, q) in [(f_nee, q_nee), (f_bsdf, q_bsdf)] {
-            // A term of zero stays zero, also where its density is zero.
-            if f != Rgb::ZERO {
-                let m = self.density(q);
-                estimate += f / m;
-                weight = weight.max(1.0 / m);
-            }
+        for (f, q) in lit(terms) {
+            let m = self.density(q);
+            estimate += f / m;
+            weight = weight.max(1.0 / m);
         }
         (estimate, weight)
     }
@@ -55,34 +61,28 @@ impl Mixture {
     /// Σ lum(f/m)/m over the terms. Its mean is Σ∫f/m, so that its ratio to the mean of f/m is the mean 1/m of the light:
     /// how many times more rarely the mixture draws it than uniform numbers would.
     #[inline]
-    pub fn rarity(&self, f_nee: Rgb, q_nee: f32, f_bsdf: Rgb, q_bsdf: f32) -> f64 {
-        let mut sum = 0.0;
-        for (f, q) in [(f_nee, q_nee), (f_bsdf, q_bsdf)] {
-            if f != Rgb::ZERO {
-                let m = f64::from(self.density(q));
-                sum += f64::from(luminance(f)) / (m * m);
-            }
-        }
-        sum
+    pub fn rarity(&self, terms: Terms) -> f64 {
+        let rarity = |(f, q)| {
+            let m = f64::from(self.density(q));
+            f64::from(luminance(f)) / (m * m)
+        };
+        lit(terms).map(rarity).sum()
     }
 
     /// f²/m of the luminances, term by term: its mean over uniform numbers is ∫f²/m, which decides the variance. For a
     /// path that the guide drew it is divided by q, too: the same integral, as far as the guide's own paths see it.
     #[inline]
-    pub fn square(&self, f_nee: Rgb, q_nee: f32, f_bsdf: Rgb, q_bsdf: f32, guided: bool) -> f64 {
-        let mut sum = 0.0;
-        for (f, q) in [(f_nee, q_nee), (f_bsdf, q_bsdf)] {
-            if f != Rgb::ZERO {
-                let drawn = if guided {
-                    q.max(f32::MIN_POSITIVE)
-                } else {
-                    1.0
-                };
-                let (y, m) = (f64::from(luminance(f)), f64::from(self.density(q)));
-                sum += y * y / (m * f64::from(drawn));
-            }
-        }
-        sum
+    pub fn square(&self, terms: Terms, guided: bool) -> f64 {
+        let square = |(f, q): (Rgb, f32)| {
+            let drawn = if guided {
+                q.max(f32::MIN_POSITIVE)
+            } else {
+                1.0
+            };
+            let (y, m) = (f64::from(luminance(f)), f64::from(self.density(q)));
+            y * y / (m * f64::from(drawn))
+        };
+        lit(terms).map(square).sum()
     }
 }
 
@@ -109,7 +109,7 @@ mod tests {
             uniform_fraction: 0.1,
         };
         let f = Rgb::new(1.0, 2.0, 3.0);
-        let (estimate, weight) = m.divide(f, 1.0, f, 1.0);
+        let (estimate, weight) = m.divide([(f, 1.0), (f, 1.0)]);
         assert!((estimate - f * 2.0).length() < 1e-5);
         assert_eq!(weight, 1.0);
     }
@@ -121,11 +121,11 @@ mod tests {
             uniform_fraction: 0.2,
         };
         let f = Rgb::splat(3.0);
-        let uniform = 0.5 * m.square(f, 2.0, Rgb::ZERO, 2.0, false);
-        let guided = m.square(f, 2.0, Rgb::ZERO, 2.0, true);
+        let uniform = 0.5 * m.square([(f, 2.0), (Rgb::ZERO, 2.0)], false);
+        let guided = m.square([(f, 2.0), (Rgb::ZERO, 2.0)], true);
         assert!((uniform - guided).abs() < 1e-9, "{uniform} {guided}");
         assert!((uniform - 4.5 / 1.8).abs() < 1e-6);
-        assert_eq!(m.square(Rgb::ZERO, 0.0, Rgb::ZERO, 0.0, true), 0.0);
+        assert_eq!(m.square([(Rgb::ZERO, 0.0), (Rgb::ZERO, 0.0)], true), 0.0);
     }
 
     #[test]
@@ -134,10 +134,10 @@ mod tests {
         let m = Mixture {
             uniform_fraction: 0.25,
         };
-        let (estimate, _) = m.divide(Rgb::ONE, 0.0, Rgb::ONE, 0.0);
-        let rarity = m.rarity(Rgb::ONE, 0.0, Rgb::ONE, 0.0);
+        let (estimate, _) = m.divide([(Rgb::ONE, 0.0), (Rgb::ONE, 0.0)]);
+        let rarity = m.rarity([(Rgb::ONE, 0.0), (Rgb::ONE, 0.0)]);
         assert!((rarity / f64::from(luminance(estimate)) - 4.0).abs() < 1e-6);
-        assert_eq!(m.rarity(Rgb::ZERO, 0.0, Rgb::ZERO, 0.0), 0.0);
+        assert_eq!(m.rarity([(Rgb::ZERO, 0.0), (Rgb::ZERO, 0.0)]), 0.0);
     }
 
     #[test]
@@ -145,8 +145,11 @@ mod tests {
         let m = Mixture {
             uniform_fraction: 0.0,
         };
-        let (estimate, weight) = m.divide(Rgb::ZERO, 0.0, Rgb::ONE, 4.0);
+        let (estimate, weight) = m.divide([(Rgb::ZERO, 0.0), (Rgb::ONE, 4.0)]);
         assert_eq!((estimate, weight), (Rgb::splat(0.25), 0.25));
-        assert_eq!(m.divide(Rgb::ZERO, 0.0, Rgb::ZERO, 0.0), (Rgb::ZERO, 0.0));
+        assert_eq!(
+            m.divide([(Rgb::ZERO, 0.0), (Rgb::ZERO, 0.0)]),
+            (Rgb::ZERO, 0.0)
+        );
     }
 }

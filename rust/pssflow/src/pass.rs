@@ -288,12 +288,11 @@ impl PassContext<'_> {
         let [width, height] = film.crop_size().map(|n| n as f32);
         for (i, &[coin, thin]) in coins.iter().enumerate() {
             let mut f = paths.f(i);
-            let (mut estimate, weight) = mixture.divide(
-                paths.f_nee[i],
-                paths.q_nee[i],
-                paths.f_bsdf[i],
-                paths.q_bsdf[i],
-            );
+            let terms = [
+                (paths.f_nee[i], paths.q_nee[i]),
+                (paths.f_bsdf[i], paths.q_bsdf[i]),
+            ];
+            let (mut estimate, weight) = mixture.divide(terms);
             if !estimate.is_finite() {
                 // Counts as a path without light, here as in the tracer.
                 piece.statistics.counts.non_finite += 1;
@@ -304,23 +303,11 @@ impl PassContext<'_> {
             if f == Rgb::ZERO {
                 continue;
             }
-            let rarity = mixture.rarity(
-                paths.f_nee[i],
-                paths.q_nee[i],
-                paths.f_bsdf[i],
-                paths.q_bsdf[i],
-            );
-            piece.statistics.add_estimate(estimate, weight, rarity);
+            let statistics = &mut piece.statistics;
+            statistics.add_estimate(estimate, weight, mixture.rarity(terms));
             if pass.guide.is_some() {
                 let guided = mixture.is_guided(coin);
-                let square = mixture.square(
-                    paths.f_nee[i],
-                    paths.q_nee[i],
-                    paths.f_bsdf[i],
-                    paths.q_bsdf[i],
-                    guided,
-                );
-                piece.statistics.squares[usize::from(guided)].add_value(square);
+                statistics.squares[usize::from(guided)].add_value(mixture.square(terms, guided));
             }
             if thin < pass.record {
                 let [x, y] = paths.film[i];

@@ -1,6 +1,6 @@
 //! Paths that carry light, kept for guides to learn from.
 
-use pss_guide::{Context, Emitter, Records};
+use pss_guide::{Emitter, OwnedRecords, Records};
 use pss_render::Paths;
 use pss_render::math::luminance;
 
@@ -11,17 +11,7 @@ use crate::numbers::context;
 /// Layout as in [`Records`].
 #[derive(Clone, Debug, Default)]
 pub(crate) struct PathRecords {
-    u: Vec<f32>,
-    f: Vec<f32>,
-    f_bsdf: Vec<f32>,
-    f_max: Vec<f32>,
-    /// Empty where there is no such ray.
-    ray: Vec<[f32; 2]>,
-    g: Vec<f32>,
-    g_bsdf: Vec<f32>,
-    g_both: Vec<f32>,
-    contexts: Vec<Context>,
-    pixel: Vec<[f32; 2]>,
+    rows: OwnedRecords,
     /// Paths that these were taken from, with and without light.
     drawn: u64,
 }
@@ -29,7 +19,7 @@ pub(crate) struct PathRecords {
 impl PathRecords {
     /// Paths kept.
     pub(crate) fn len(&self) -> usize {
-        self.f.len()
+        self.rows.f.len()
     }
 
     /// Counts paths that a pass drew, kept or not.
@@ -49,21 +39,23 @@ impl PathRecords {
     ) {
         let f = paths.f(i);
         let (u, ray) = paths.u[i * width..][..width].split_at(learned);
-        self.u.extend_from_slice(u);
-        self.ray.extend(ray.as_chunks().0);
-        self.f.push(luminance(f));
-        self.f_bsdf.push(luminance(paths.f_bsdf[i]));
-        self.f_max.push(f.max_element());
-        self.g.push(mixture.density(paths.q_nee[i]) * kept);
-        self.g_bsdf.push(mixture.density(paths.q_bsdf[i]) * kept);
+        self.rows.u.extend_from_slice(u);
+        self.rows.ray.extend(ray.as_chunks().0);
+        self.rows.f.push(luminance(f));
+        self.rows.f_bsdf.push(luminance(paths.f_bsdf[i]));
+        self.rows.f_max.push(f.max_element());
+        self.rows.g.push(mixture.density(paths.q_nee[i]) * kept);
+        self.rows
+            .g_bsdf
+            .push(mixture.density(paths.q_bsdf[i]) * kept);
         let both = paths.q_nee[i] * paths.q_ray[i];
-        self.g_both.push(mixture.density(both) * kept);
-        self.pixel.push(pixel);
+        self.rows.g_both.push(mixture.density(both) * kept);
+        self.rows.pixel.push(pixel);
         if paths.record {
             let k = learned / 2;
             let vertices = paths.contexts[i * k..][..k].iter();
-            self.contexts.extend(vertices.map(context));
-            if let Some(last) = self.contexts.last_mut() {
+            self.rows.contexts.extend(vertices.map(context));
+            if let Some(last) = self.rows.contexts.last_mut() {
                 last.emitter = paths.emitter(i);
             }
         }
@@ -89,22 +81,26 @@ impl PathRecords {
 
     fn try_reserve(&mut self, paths: usize, width: usize, vertices: usize) -> bool {
         let more = paths.saturating_sub(self.len());
-        let mut room = self.u.try_reserve_exact(more * width).is_ok();
+        let mut room = self.rows.u.try_reserve_exact(more * width).is_ok();
         for numbers in self.numbers() {
             room = room && numbers.try_reserve_exact(more).is_ok();
         }
-        room && self.contexts.try_reserve_exact(more * vertices).is_ok()
-            && self.ray.try_reserve_exact(more).is_ok()
-            && self.pixel.try_reserve_exact(more).is_ok()
+        room && self
+            .rows
+            .contexts
+            .try_reserve_exact(more * vertices)
+            .is_ok()
+            && self.rows.ray.try_reserve_exact(more).is_ok()
+            && self.rows.pixel.try_reserve_exact(more).is_ok()
     }
 
     /// Gives back what no path fills.
     fn shrink(&mut self) {
-        self.u.shrink_to_fit();
+        self.rows.u.shrink_to_fit();
         self.numbers().into_iter().for_each(Vec::shrink_to_fit);
-        self.contexts.shrink_to_fit();
-        self.ray.shrink_to_fit();
-        self.pixel.shrink_to_fit();
+        self.rows.contexts.shrink_to_fit();
+        self.rows.ray.shrink_to_fit();
+        self.rows.pixel.shrink_to_fit();
     }
 
     /// Keeps, evenly from first to last, `most[0]` of the first `older` paths and `most[1]` of those behind them; each
@@ -122,7 +118,11 @@ impl PathRecords {
             let at = (row - parts[i].start) as u64;
             (at + 1) * kept[i] / sizes[i] > at * kept[i] / sizes[i]
         };
-        for density in [&mut self.g, &mut self.g_bsdf, &mut self.g_both] {
+        for density in [
+            &mut self.rows.g,
+            &mut self.rows.g_bsdf,
+            &mut self.rows.g_both,
+        ] {
             for (part, (kept, size)) in parts.iter().zip(kept.iter().zip(sizes)) {
                 let share = *kept as f32 / size as f32;
                 density[part.clone()].iter_mut().for_each(|g| *g *= share);
@@ -131,33 +131,37 @@ impl PathRecords {
         for numbers in self.numbers() {
             keep(numbers, all, stays);
         }
-        keep(&mut self.u, all, stays);
-        keep(&mut self.ray, all, stays);
-        keep(&mut self.contexts, all, stays);
-        keep(&mut self.pixel, all, stays);
+        keep(&mut self.rows.u, all, stays);
+        keep(&mut self.rows.ray, all, stays);
+        keep(&mut self.rows.contexts, all, stays);
+        keep(&mut self.rows.pixel, all, stays);
     }
 
     fn numbers(&mut self) -> [&mut Vec<f32>; 6] {
         [
-            &mut self.f,
-            &mut self.f_bsdf,
-            &mut self.f_max,
-            &mut self.g,
-            &mut self.g_bsdf,
-            &mut self.g_both,
+            &mut self.rows.f,
+            &mut self.rows.f_bsdf,
+            &mut self.rows.f_max,
+            &mut self.rows.g,
+            &mut self.rows.g_bsdf,
+            &mut self.rows.g_both,
         ]
     }
 
     /// Makes room for so many more, and says whether there was any: a plain vector would end the process.
     fn has_room_for(&mut self, other: &Self) -> bool {
         let more = other.len();
-        let mut room = self.u.try_reserve(other.u.len()).is_ok();
+        let mut room = self.rows.u.try_reserve(other.rows.u.len()).is_ok();
         for numbers in self.numbers() {
             room = room && numbers.try_reserve(more).is_ok();
         }
-        room && self.contexts.try_reserve(other.contexts.len()).is_ok()
-            && self.ray.try_reserve(other.ray.len()).is_ok()
-            && self.pixel.try_reserve(more).is_ok()
+        room && self
+            .rows
+            .contexts
+            .try_reserve(other.rows.contexts.len())
+            .is_ok()
+            && self.rows.ray.try_reserve(other.rows.ray.len()).is_ok()
+            && self.rows.pixel.try_reserve(more).is_ok()
     }
 
     /// Takes over the paths of `other`, of which the first `older` of all came before this pass. Where memory does not
@@ -186,36 +190,23 @@ impl PathRecords {
     }
 
     fn take(&mut self, other: &mut Self) {
-        self.u.append(&mut other.u);
-        self.f.append(&mut other.f);
-        self.f_bsdf.append(&mut other.f_bsdf);
-        self.f_max.append(&mut other.f_max);
-        self.g.append(&mut other.g);
-        self.ray.append(&mut other.ray);
-        self.g_bsdf.append(&mut other.g_bsdf);
-        self.g_both.append(&mut other.g_both);
-        self.contexts.append(&mut other.contexts);
-        self.pixel.append(&mut other.pixel);
+        self.rows.u.append(&mut other.rows.u);
+        self.rows.f.append(&mut other.rows.f);
+        self.rows.f_bsdf.append(&mut other.rows.f_bsdf);
+        self.rows.f_max.append(&mut other.rows.f_max);
+        self.rows.g.append(&mut other.rows.g);
+        self.rows.ray.append(&mut other.rows.ray);
+        self.rows.g_bsdf.append(&mut other.rows.g_bsdf);
+        self.rows.g_both.append(&mut other.rows.g_both);
+        self.rows.contexts.append(&mut other.rows.contexts);
+        self.rows.pixel.append(&mut other.rows.pixel);
         self.drawn += other.drawn;
     }
 
     /// What a guide learns from.
     pub(crate) fn view<'a>(&'a self, dims: usize, emitters: &'a [Emitter]) -> Records<'a> {
-        Records {
-            dims,
-            u: &self.u,
-            f: &self.f,
-            f_bsdf: &self.f_bsdf,
-            f_max: &self.f_max,
-            g: &self.g,
-            ray: &self.ray,
-            g_bsdf: &self.g_bsdf,
-            g_both: &self.g_both,
-            contexts: &self.contexts,
-            pixel: &self.pixel,
-            emitters,
-            zeros: self.drawn.saturating_sub(self.f.len() as u64),
-        }
+        let zeros = self.drawn.saturating_sub(self.len() as u64);
+        self.rows.view(dims, emitters, zeros)
     }
 }
 
@@ -239,35 +230,44 @@ mod tests {
         let paths = 1000u16;
         let values = || (0..paths).map(f32::from);
         let mut records = PathRecords {
-            u: values().flat_map(|x| [x, -x]).collect(),
-            f: values().collect(),
-            f_bsdf: values().collect(),
-            f_max: values().collect(),
-            g: vec![1.0; paths.into()],
-            ray: values().map(|x| [x, -x]).collect(),
-            g_bsdf: vec![2.0; paths.into()],
-            g_both: vec![4.0; paths.into()],
-            contexts: Vec::new(),
-            pixel: values().map(|x| [x, x]).collect(),
+            rows: OwnedRecords {
+                u: values().flat_map(|x| [x, -x]).collect(),
+                f: values().collect(),
+                f_bsdf: values().collect(),
+                f_max: values().collect(),
+                g: vec![1.0; paths.into()],
+                ray: values().map(|x| [x, -x]).collect(),
+                g_bsdf: vec![2.0; paths.into()],
+                g_both: vec![4.0; paths.into()],
+                contexts: Vec::new(),
+                pixel: values().map(|x| [x, x]).collect(),
+            },
             drawn: 4000,
         };
-        let sum = |r: &PathRecords| r.f.iter().zip(&r.g).map(|(f, g)| f / g).sum::<f32>();
+        let sum = |r: &PathRecords| {
+            r.rows
+                .f
+                .iter()
+                .zip(&r.rows.g)
+                .map(|(f, g)| f / g)
+                .sum::<f32>()
+        };
         let before = sum(&records);
         records.thin(400, [400, 600]);
         assert_eq!(records.len(), 1000);
         records.thin(400, [50, 250]);
         assert_eq!(records.len(), 300);
-        assert!(records.f[49] < 400.0 && records.f[50] >= 400.0);
-        for (i, &x) in records.f.iter().enumerate() {
-            assert_eq!(records.g_bsdf[i], 2.0 * records.g[i]);
-            assert_eq!(records.g_both[i], 4.0 * records.g[i]);
-            assert_eq!(records.ray[i], [x, -x]);
-            assert_eq!(records.u[2 * i..2 * i + 2], [x, -x]);
-            assert_eq!(records.pixel[i], [x, x]);
+        assert!(records.rows.f[49] < 400.0 && records.rows.f[50] >= 400.0);
+        for (i, &x) in records.rows.f.iter().enumerate() {
+            assert_eq!(records.rows.g_bsdf[i], 2.0 * records.rows.g[i]);
+            assert_eq!(records.rows.g_both[i], 4.0 * records.rows.g[i]);
+            assert_eq!(records.rows.ray[i], [x, -x]);
+            assert_eq!(records.rows.u[2 * i..2 * i + 2], [x, -x]);
+            assert_eq!(records.rows.pixel[i], [x, x]);
         }
         assert!((sum(&records) / before - 1.0).abs() < 0.02);
         records.thin(50, [0, 0]);
-        assert!(records.u.is_empty() && records.pixel.is_empty());
+        assert!(records.rows.u.is_empty() && records.rows.pixel.is_empty());
     }
 
     #[test]
@@ -278,9 +278,9 @@ mod tests {
         let wanted = usize::MAX / 4096;
         let room = records.reserve(wanted, 5, true);
         assert!(room < wanted / 2, "{room}");
-        assert!(records.u.capacity() < wanted);
+        assert!(records.rows.u.capacity() < wanted);
         // Paths that are there stay.
-        records.f = vec![1.0; 3];
+        records.rows.f = vec![1.0; 3];
         records.reserve(wanted, 5, false);
         assert_eq!(records.len(), 3);
     }
